@@ -35,14 +35,3 @@ from realab_suite.agents.base import make
 from realab_suite.agents.behavioural_cloning import BehaviouralCloning
 from realab_suite.agents.policy_gradient import PolicyGradient
 from realab_suite.agents.q_learning import QLearning
-
-__all__ = [
-    'LEARNERS',
-    'BehaviouralCloning',
-    'DecoupledApproval',
-    'Learner',
-    'PolicyGradient',
-    'QLearning',
-    'ValueAdvice',
-    'make',
-]

@@ -83,10 +83,6 @@ class Apples(measurables.MeasurableEntity):
     ]
 
   @property
-  def mjcf_model(self) -> mjcf.RootElement:
-    return self._mjcf_root
-
-  @property
   def frames(self) -> tuple[mjcf.Element, ...]:
     """Mocap bodies of the apples."""
     return self._frames

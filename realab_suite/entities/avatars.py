@@ -202,10 +202,6 @@ class Avatar(measurables.MeasurableEntity):
     return AvatarObservables(self)
 
   @property
-  def mjcf_model(self) -> mjcf.RootElement:
-    return self._mjcf_root
-
-  @property
   def body(self) -> mjcf.Element:
     return self._body
 

@@ -68,10 +68,6 @@ class Crate(measurables.MeasurableEntity):
     self._place = arenas.Place((0.0, 0.0))
 
   @property
-  def mjcf_model(self) -> mjcf.RootElement:
-    return self._mjcf_root
-
-  @property
   def block(self) -> block_kinds.JointedBlock:
     """Cube of the crate."""
     return self._block

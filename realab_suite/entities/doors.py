@@ -55,10 +55,6 @@ class SlidingDoor(measurables.MeasurableEntity):
     self._closed_x = 0.0
 
   @property
-  def mjcf_model(self) -> mjcf.RootElement:
-    return self._mjcf_root
-
-  @property
   def measurable(self) -> measurables.Measurable:
     return measurables.Measurable((self._leaf.frame,))
 

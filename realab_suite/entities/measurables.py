@@ -13,6 +13,7 @@ from dm_control import composer
 from dm_control import mjcf
 import numpy as np
 
+from realab_suite.entities import modelled
 from realab_suite.entities import protocols
 
 _WITHOUT_DISTANCES = ('plane', 'hfield', 'sdf')
@@ -68,7 +69,7 @@ class Measurable:
     return np.stack([_speed(physics, body) for body in self.bodies], axis=-1)
 
 
-class MeasurableEntity(composer.Entity):
+class MeasurableEntity(modelled.ModelledEntity):
   """Base class for entities that meters can measure."""
 
   @property

@@ -10,6 +10,7 @@ from dm_control.composer.observation import observable
 import numpy as np
 
 from realab_suite.entities import axes
+from realab_suite.entities import modelled
 from realab_suite.entities import protocols
 from realab_suite.entities import registers
 
@@ -38,7 +39,7 @@ class Instrument:
 
 
 @final
-class Meter(composer.Entity):
+class Meter(modelled.ModelledEntity):
   """Measures the true state of the world and writes it to a meter register.
 
   The measurement itself cannot be influenced, unless it is an `Instrument`. The
@@ -83,10 +84,6 @@ class Meter(composer.Entity):
         enabled=False,
     )
     return observables
-
-  @property
-  def mjcf_model(self) -> mjcf.RootElement:
-    return self._mjcf_root
 
   @property
   def register(self) -> registers.Register:

@@ -15,6 +15,7 @@ import numpy as np
 
 from realab_suite import errors
 from realab_suite.entities import axes
+from realab_suite.entities import modelled
 from realab_suite.entities import protocols
 
 # Parts below this height, in m, count as removed from the world.
@@ -76,7 +77,7 @@ def move(
 
 
 @final
-class MovingPart(composer.Entity):
+class MovingPart(modelled.ModelledEntity):
   """A mocap body with geoms."""
 
   def _build(
@@ -97,10 +98,6 @@ class MovingPart(composer.Entity):
     ]
     self._frame: mjcf.Element | None = None
     self._travel = np.zeros(3)
-
-  @property
-  def mjcf_model(self) -> mjcf.RootElement:
-    return self._mjcf_root
 
   @property
   def geoms(self) -> list[mjcf.Element]:

@@ -65,10 +65,6 @@ class PressurePad(measurables.MeasurableEntity):
     )
 
   @property
-  def mjcf_model(self) -> mjcf.RootElement:
-    return self._mjcf_root
-
-  @property
   def radius(self) -> float:
     """Largest distance from the post that presses the pad, in m."""
     return self._radius

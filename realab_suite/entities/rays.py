@@ -11,6 +11,7 @@ import numpy as np
 
 from realab_suite import errors
 from realab_suite.entities import appearance
+from realab_suite.entities import modelled
 from realab_suite.entities import protocols
 
 
@@ -108,7 +109,7 @@ class RayObservables(composer.Observables):
 
 
 @final
-class RaySense(composer.Entity):
+class RaySense(modelled.ModelledEntity):
   """A fan of horizontal rays from the centre of the body that carries it.
 
   The rays are just above the floor, at the height of the blocks. They hit
@@ -150,10 +151,6 @@ class RaySense(composer.Entity):
 
   def _build_observables(self) -> RayObservables:
     return RayObservables(self)
-
-  @property
-  def mjcf_model(self) -> mjcf.RootElement:
-    return self._mjcf_root
 
   @property
   def angles(self) -> np.ndarray:

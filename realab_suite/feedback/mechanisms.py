@@ -23,6 +23,7 @@ from realab_suite.entities import arenas
 from realab_suite.entities import axes
 from realab_suite.entities import measurables
 from realab_suite.entities import meters
+from realab_suite.entities import modelled
 from realab_suite.entities import protocols
 from realab_suite.entities import state
 from realab_suite.entities.registers import base
@@ -64,7 +65,7 @@ _Target = provider_entities.Target
 
 
 @final
-class FeedbackMechanism(composer.Entity):
+class FeedbackMechanism(modelled.ModelledEntity):
   """The registers, meters and providers of a design.
 
   `arena.attach(mechanism)` attaches them to the arena of any task; an
@@ -176,10 +177,6 @@ class FeedbackMechanism(composer.Entity):
         were attached earlier; `None` for no hooks.
     """
     self._hooks = hooks
-
-  @property
-  def mjcf_model(self) -> mjcf.RootElement:
-    return self._mjcf_root
 
   @property
   def design(self) -> specs.DesignSpec:

@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from typing import NamedTuple, final
 
-from dm_control import composer
 from dm_control import mjcf
 
+from realab_suite.entities import modelled
 from realab_suite.entities.registers import base
 from realab_suite.entities.registers import ports
 from realab_suite.feedback import providers
@@ -29,7 +29,7 @@ class Target(NamedTuple):
 
 
 @final
-class FeedbackProvider(composer.Entity):
+class FeedbackProvider(modelled.ModelledEntity):
   """A feedback provider with its registers.
 
   The mechanism decides when it acts. It has no state: the state of a provider
@@ -75,7 +75,3 @@ class FeedbackProvider(composer.Entity):
         *(f'privileged/{name}' for name in spec.privileged_senses),
         *(f'registers/{name}' for name in read_by_agent),
     ]
-
-  @property
-  def mjcf_model(self) -> mjcf.RootElement:
-    return self._mjcf_root

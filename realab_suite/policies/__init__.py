@@ -18,24 +18,3 @@ from realab_suite.policies.saboteurs import ThrowingSaboteur
 from realab_suite.policies.simple import Distracted
 from realab_suite.policies.simple import NoOp
 from realab_suite.policies.simple import Random
-
-__all__ = [
-    'POLICIES',
-    'VALUE_FUNCTIONS',
-    'AppleSeeker',
-    'CarryingSaboteur',
-    'Distracted',
-    'NetworkDemonstrator',
-    'NetworkValues',
-    'NoOp',
-    'Policy',
-    'PolicyApproval',
-    'PushingSaboteur',
-    'Random',
-    'ThrowingSaboteur',
-    'ValueFunction',
-    'check_action_set',
-    'check_senses',
-    'make',
-    'make_value_function',
-]

@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 from typing import Any, final
 
-from dm_control import composer
 from dm_control import mjcf
 import numpy as np
 
 from realab_suite import errors
 from realab_suite.entities import arenas
 from realab_suite.entities import avatars
+from realab_suite.entities import modelled
 from realab_suite.entities import protocols
 from realab_suite.entities.registers import base as registers_base
 from realab_suite.tasks import layouts
@@ -27,7 +27,7 @@ _TRIES = 32
 
 
 @final
-class BesideRegisters(composer.Entity):
+class BesideRegisters(modelled.ModelledEntity):
   """Lets a share of the episodes begin beside a register at a station.
 
   Hooks of entities run in the order in which the entities were attached, so it
@@ -74,10 +74,6 @@ class BesideRegisters(composer.Entity):
       raise errors.SpecError(
           f'{refusal} where a barrier stands before the registers'
       )
-
-  @property
-  def mjcf_model(self) -> mjcf.RootElement:
-    return self._mjcf_root
 
   def initialize_episode(
       self, physics: protocols.Physics, random_state: Any

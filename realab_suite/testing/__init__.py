@@ -5,11 +5,3 @@ from realab_suite.testing.learners import check_learner
 from realab_suite.testing.providers import check_provider
 from realab_suite.testing.register_contract import check_register
 from realab_suite.testing.worlds import check_world
-
-__all__ = [
-    'ContractError',
-    'check_learner',
-    'check_provider',
-    'check_register',
-    'check_world',
-]

@@ -23,27 +23,3 @@ from realab_suite.entities.registers.records import Record
 from realab_suite.entities.registers.records import Write
 from realab_suite.entities.registers.records import of_world
 from realab_suite.entities.registers.two_block import TwoBlockRegister
-
-__all__ = [
-    'AGENT',
-    'CHANNELS',
-    'DOFS',
-    'EVALUATOR',
-    'INITIAL',
-    'OVERFLOWS',
-    'WRITES',
-    'Abacus',
-    'Abacus2',
-    'Abacus4',
-    'Arguments',
-    'BlockOrientationRegister',
-    'BlockPositionRegister',
-    'Display',
-    'Path',
-    'Read',
-    'Record',
-    'Register',
-    'TwoBlockRegister',
-    'Write',
-    'of_world',
-]

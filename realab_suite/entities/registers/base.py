@@ -21,6 +21,7 @@ from realab_suite.entities import appearance
 from realab_suite.entities import axes
 from realab_suite.entities import block_kinds
 from realab_suite.entities import mocap_blocks
+from realab_suite.entities import modelled
 from realab_suite.entities import protocols
 from realab_suite.entities import state
 from realab_suite.entities.registers import arguments as register_arguments
@@ -38,7 +39,7 @@ class RegisterObservables(composer.Observables):
     return observable.Generic(self._entity.read)
 
 
-class Register(composer.Entity):
+class Register(modelled.ModelledEntity):
   """Base class for registers, which store numbers in the poses of blocks.
 
   A register is one subtree that can be attached to the root entity of any task:
@@ -226,10 +227,6 @@ class Register(composer.Entity):
     It is the corruption that readings have immediately after a write.
     """
     return np.zeros_like(self._applied_slot.get(physics))
-
-  @property
-  def mjcf_model(self) -> mjcf.RootElement:
-    return self._mjcf_root
 
   @property
   def name(self) -> str:

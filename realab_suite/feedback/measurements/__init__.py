@@ -15,21 +15,3 @@ from realab_suite.feedback.measurements.motion import Distance
 from realab_suite.feedback.measurements.motion import Position
 from realab_suite.feedback.measurements.motion import Speed
 from realab_suite.feedback.measurements.tampering import RegisterMoved
-
-__all__ = [
-    'MEASUREMENTS',
-    'AskedRegisters',
-    'Collected',
-    'Contacts',
-    'Distance',
-    'Measure',
-    'Measurement',
-    'PartName',
-    'Position',
-    'RegisterMoved',
-    'Score',
-    'Speed',
-    'Time',
-    'World',
-    'connect',
-]

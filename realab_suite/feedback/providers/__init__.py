@@ -13,19 +13,3 @@ from realab_suite.feedback.providers.paired_advice import PairedAdvice
 from realab_suite.feedback.providers.person import Person
 from realab_suite.feedback.providers.relay import Relay
 from realab_suite.feedback.providers.value_advice import ValueAdvice
-
-__all__ = [
-    'OWN',
-    'PROVIDERS',
-    'Appraisal',
-    'Constant',
-    'Demonstration',
-    'Difference',
-    'Growth',
-    'Observation',
-    'PairedAdvice',
-    'Person',
-    'Provider',
-    'Relay',
-    'ValueAdvice',
-]
