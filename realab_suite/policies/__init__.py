@@ -4,6 +4,7 @@ from realab_suite.policies.apple_seeker import AppleSeeker
 from realab_suite.policies.approval import PolicyApproval
 from realab_suite.policies.base import POLICIES
 from realab_suite.policies.base import VALUE_FUNCTIONS
+from realab_suite.policies.base import Follower
 from realab_suite.policies.base import Policy
 from realab_suite.policies.base import ValueFunction
 from realab_suite.policies.base import check_action_set

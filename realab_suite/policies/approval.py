@@ -7,13 +7,12 @@ import numpy as np
 
 from realab_suite.config import option_types
 from realab_suite.entities import avatars
-from realab_suite.policies import action_sets
 from realab_suite.policies import base
 
 
 @base.VALUE_FUNCTIONS.add('apple_seeker_approval')
 @final
-class PolicyApproval(base.ValueFunction):
+class PolicyApproval(base.Follower, base.ValueFunction):
   """Values actions by their distance from the action of a policy.
 
   The value of the policy's own action is 1. It falls with the distance between
@@ -42,19 +41,8 @@ class PolicyApproval(base.ValueFunction):
     self._values = 1.0 - 2.0 * distances / distances.max()
 
   @property
-  def action_set(self) -> action_sets.ActionSet:
-    return self._policy.action_set
-
-  @property
-  def required_senses(self) -> tuple[str, ...]:
-    return self._policy.required_senses
-
-  @property
-  def privileged_senses(self) -> tuple[str, ...]:
-    return self._policy.privileged_senses
-
-  def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
-    return self._policy.initial_state(batch_shape)
+  def followed(self) -> base.Reader:
+    return self._policy
 
   def step(
       self,

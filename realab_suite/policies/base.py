@@ -25,34 +25,22 @@ SOLVER_APPROVAL = 'solver_approval'
 """Value function of that solver."""
 
 
-class Policy(abc.ABC):
-  """Function from observations to actions, which are indices."""
+class Reader(abc.ABC):  # noqa: B024 - `Policy` and `ValueFunction` have steps.
+  """Base class for policies and value functions, which read observations."""
 
   @property
   def action_set(self) -> action_sets.ActionSet:
-    """Action set of the indices."""
+    """Action set of the indices, or of the values."""
     return action_sets.DMLAB_LIKE
-
-  def in_action_set(self, action_set: action_sets.ActionSet) -> 'Policy':
-    """Returns the policy to use where actions are those of another set.
-
-    A policy that acts in any world returns one for that set. Others know what
-    their actions mean, and return themselves.
-
-    Args:
-      action_set: Action set of the world.
-    """
-    del action_set
-    return self
 
   @property
   def required_senses(self) -> tuple[str, ...]:
-    """Names of the senses that the policy reads from observations."""
+    """Names of the senses that it reads from observations."""
     return ()
 
   @property
   def privileged_senses(self) -> tuple[str, ...]:
-    """Names of functions of the task that the policy reads as well.
+    """Names of functions of the task that it reads as well.
 
     They are keys of `Task.privileged_senses`, and in observations
     `privileged/<name>`. No agent has them, so a policy that reads them is a
@@ -71,6 +59,46 @@ class Policy(abc.ABC):
     """
     del batch_shape
     return ()
+
+
+class Follower(Reader):
+  """Base class for what reads and remembers the same as another reader."""
+
+  @property
+  @abc.abstractmethod
+  def followed(self) -> Reader:
+    """The other policy or value function."""
+
+  @property
+  def action_set(self) -> action_sets.ActionSet:
+    return self.followed.action_set
+
+  @property
+  def required_senses(self) -> tuple[str, ...]:
+    return self.followed.required_senses
+
+  @property
+  def privileged_senses(self) -> tuple[str, ...]:
+    return self.followed.privileged_senses
+
+  def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
+    return self.followed.initial_state(batch_shape)
+
+
+class Policy(Reader):
+  """Function from observations to actions, which are indices."""
+
+  def in_action_set(self, action_set: action_sets.ActionSet) -> 'Policy':
+    """Returns the policy to use where actions are those of another set.
+
+    A policy that acts in any world returns one for that set. Others know what
+    their actions mean, and return themselves.
+
+    Args:
+      action_set: Action set of the world.
+    """
+    del action_set
+    return self
 
   @abc.abstractmethod
   def step(
@@ -93,28 +121,8 @@ class Policy(abc.ABC):
     """
 
 
-class ValueFunction(abc.ABC):
+class ValueFunction(Reader):
   """Function from observations to a value of each action."""
-
-  @property
-  def action_set(self) -> action_sets.ActionSet:
-    """Action set of the values."""
-    return action_sets.DMLAB_LIKE
-
-  @property
-  def required_senses(self) -> tuple[str, ...]:
-    """Names of the senses that the value function reads from observations."""
-    return ()
-
-  @property
-  def privileged_senses(self) -> tuple[str, ...]:
-    """Names of functions of the task that it reads as well; see `Policy`."""
-    return ()
-
-  def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
-    """Returns the state before the first step; see `Policy`."""
-    del batch_shape
-    return ()
 
   @abc.abstractmethod
   def step(

@@ -5,6 +5,7 @@ true reward, which a supervisor may use (paper, sections 2.2 and 3.1). Its
 inputs are the senses of an agent, without readings of registers.
 """
 
+import abc
 from collections.abc import Mapping, Sequence
 from typing import Any, final
 
@@ -21,13 +22,8 @@ _RAY_SCALE = 2.0
 _SENSES = 'senses/'
 
 
-@base.POLICIES.add('network_demonstrator')
-@final
-class NetworkDemonstrator(base.Policy):
-  """Takes the action with the largest output of a network.
-
-  The policy has no state, so agents without memory can imitate it.
-  """
+class _NetworkReader(base.Reader, abc.ABC):
+  """Base class for policies and value functions that a network computes."""
 
   def __init__(
       self,
@@ -35,7 +31,7 @@ class NetworkDemonstrator(base.Policy):
           option_types.FilePath | network_files.Network
       ) = 'demonstrator_v1',
   ) -> None:
-    """Makes the policy.
+    """Makes the policy or the value function.
 
     Args:
       weights: Name of a network that ships with the package, path of a file, or
@@ -52,7 +48,23 @@ class NetworkDemonstrator(base.Policy):
 
   @property
   def required_senses(self) -> tuple[str, ...]:
-    return _senses(self._network)
+    keys = [
+        key
+        for feature in self._network.header.features
+        for key in (feature.name, feature.partner)
+    ]
+    return tuple(
+        key.removeprefix(_SENSES) for key in keys if key.startswith(_SENSES)
+    )
+
+
+@base.POLICIES.add('network_demonstrator')
+@final
+class NetworkDemonstrator(_NetworkReader, base.Policy):
+  """Takes the action with the largest output of a network.
+
+  The policy has no state, so agents without memory can imitate it.
+  """
 
   def step(
       self,
@@ -68,7 +80,7 @@ class NetworkDemonstrator(base.Policy):
 
 @base.VALUE_FUNCTIONS.add('network_values')
 @final
-class NetworkValues(base.ValueFunction):
+class NetworkValues(_NetworkReader, base.ValueFunction):
   """Values actions by the log-probabilities of a trained policy.
 
   The values are scaled linearly: 1 for the best action, -1 for the worst.
@@ -76,23 +88,6 @@ class NetworkValues(base.ValueFunction):
   approximate advantages. A learner that maximises these values in each step
   alone takes the actions of the policy, which was trained on whole returns.
   """
-
-  def __init__(
-      self,
-      weights: (
-          option_types.FilePath | network_files.Network
-      ) = 'demonstrator_v1',
-  ) -> None:
-    """Makes the value function; see `NetworkDemonstrator` for arguments."""
-    self._network = network_files.load(weights)
-
-  @property
-  def action_set(self) -> action_sets.ActionSet:
-    return self._network.header.actions()
-
-  @property
-  def required_senses(self) -> tuple[str, ...]:
-    return _senses(self._network)
 
   def step(
       self,
@@ -108,18 +103,6 @@ class NetworkValues(base.ValueFunction):
     # With equal outputs, all actions have the best value.
     spread = np.where(high > low, high - low, np.inf)
     return (1.0 - 2.0 * (high - values) / spread).astype(float), state
-
-
-def _senses(network: network_files.Network) -> tuple[str, ...]:
-  """Returns the names of the senses that are inputs of a network."""
-  keys = [
-      key
-      for feature in network.header.features
-      for key in (feature.name, feature.partner)
-  ]
-  return tuple(
-      key.removeprefix(_SENSES) for key in keys if key.startswith(_SENSES)
-  )
 
 
 def outputs(

@@ -68,7 +68,7 @@ class Random(_Blind):
 
 
 @final
-class Distracted(base.Policy):
+class Distracted(base.Follower, base.Policy):
   """Takes the actions of another policy, and random ones in some steps."""
 
   def __init__(self, policy: base.Policy, share: float) -> None:
@@ -82,22 +82,11 @@ class Distracted(base.Policy):
     self._share = share
 
   @property
-  def action_set(self) -> action_sets.ActionSet:
-    return self._policy.action_set
+  def followed(self) -> base.Reader:
+    return self._policy
 
   def in_action_set(self, action_set: action_sets.ActionSet) -> base.Policy:
     return Distracted(self._policy.in_action_set(action_set), self._share)
-
-  @property
-  def required_senses(self) -> tuple[str, ...]:
-    return self._policy.required_senses
-
-  @property
-  def privileged_senses(self) -> tuple[str, ...]:
-    return self._policy.privileged_senses
-
-  def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
-    return self._policy.initial_state(batch_shape)
 
   def step(
       self,

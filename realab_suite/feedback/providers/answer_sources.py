@@ -104,7 +104,7 @@ ANSWERS: registry.Registry[Callable[..., Source]] = registry.Registry(
 
 @ANSWERS.add('simulated')
 @final
-class Simulated(Source):
+class Simulated(policies.Follower, Source):
   """Simulation of a person, who judges actions by a value function.
 
   An action with a positive value is approved; otherwise the best one is the
@@ -146,16 +146,8 @@ class Simulated(Source):
     self._fatigue, self._patience = fatigue, patience
 
   @property
-  def action_set(self) -> action_sets.ActionSet | None:
-    return self._adviser.action_set
-
-  @property
-  def required_senses(self) -> tuple[str, ...]:
-    return self._adviser.required_senses
-
-  @property
-  def privileged_senses(self) -> tuple[str, ...]:
-    return self._adviser.privileged_senses
+  def followed(self) -> policies.ValueFunction:
+    return self._adviser
 
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
     return {

@@ -13,7 +13,7 @@ from realab_suite.feedback.providers import base
 
 @base.PROVIDERS.add('demonstration')
 @final
-class Demonstration(base.Provider):
+class Demonstration(policies.Follower, base.Provider):
   """Provider that writes the action of a policy for the agent's observation.
 
   The value is the index of the action.
@@ -35,23 +35,12 @@ class Demonstration(base.Provider):
     return self.writes
 
   @functools.cached_property
-  def demonstrator(self) -> policies.Policy:
+  def followed(self) -> policies.Policy:
     """Policy that chooses the demonstrated actions."""
     return policies.make(self.policy, **self.options)
 
   def check(self, design: Any) -> None:
-    policies.check_action_set(self.demonstrator.action_set, design, self.kind)
-
-  @property
-  def required_senses(self) -> tuple[str, ...]:
-    return self.demonstrator.required_senses
-
-  @property
-  def privileged_senses(self) -> tuple[str, ...]:
-    return self.demonstrator.privileged_senses
-
-  def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
-    return self.demonstrator.initial_state(batch_shape)
+    policies.check_action_set(self.action_set, design, self.kind)
 
   def step(
       self,
@@ -62,7 +51,5 @@ class Demonstration(base.Provider):
       state: Any,
   ) -> tuple[dict[str, np.ndarray], Any]:
     del readings
-    action, state = self.demonstrator.step(
-        observation, episode_start, key, state
-    )
+    action, state = self.followed.step(observation, episode_start, key, state)
     return {self.writes[0]: np.asarray(action, float)}, state

@@ -1,13 +1,10 @@
 """Value advice: the value of a queried action (paper, section 3.4)."""
 
-import functools
-from typing import Annotated, Any, Literal, final
+from typing import Any, Literal, final
 
 import numpy as np
-import pydantic
 
-from realab_suite import policies
-from realab_suite.config import option_types
+from realab_suite.feedback.providers import advice
 from realab_suite.feedback.providers import base
 from realab_suite.feedback.providers import queries
 
@@ -17,7 +14,7 @@ _WITHOUT_DELAY = ('value_advice', 'decoupled_approval')
 
 @base.PROVIDERS.add('value_advice')
 @final
-class ValueAdvice(base.Provider):
+class ValueAdvice(advice.Advice):
   """Provider that writes the value of the action that a query register holds.
 
   The query is read from the blocks of the query register, so it can be
@@ -25,8 +22,8 @@ class ValueAdvice(base.Provider):
   (section 3.4, footnote).
 
   Attributes:
-    value_function: Name of a registered value function.
-    options: Keyword arguments of the value function.
+    value_function: See `Advice`.
+    options: See `Advice`.
     query_delay: 0 to evaluate the query of the current step in the observation
       of the current step; 1 to evaluate the query of the previous step in the
       observation of the previous step, as in the paper's example.
@@ -34,31 +31,10 @@ class ValueAdvice(base.Provider):
 
   kind: Literal['value_advice'] = 'value_advice'
   reads: base.OneName
-  writes: base.OneName
-  value_function: Annotated[str, option_types.NameIn(policies.VALUE_FUNCTIONS)]
-  options: Annotated[
-      dict[str, Any],
-      option_types.OptionsOf(policies.VALUE_FUNCTIONS, 'value_function'),
-  ] = pydantic.Field(default_factory=dict)
   query_delay: Literal[0, 1] = 0
 
-  @property
-  def action_queries(self) -> tuple[str, ...]:
-    return self.reads
-
-  @functools.cached_property
-  def adviser(self) -> policies.ValueFunction:
-    """Value function that computes the advice."""
-    return policies.make_value_function(self.value_function, **self.options)
-
   def check(self, design: Any) -> None:
-    policies.check_action_set(self.adviser.action_set, design, self.kind)
-    query = self.reads[0]
-    if design.ports[query].role != 'query':
-      raise ValueError(
-          f'value_advice reads the query from {query!r}, whose role is'
-          f' {design.ports[query].role!r}; allowed is query'
-      )
+    super().check(design)
     learner = None if design.learner is None else design.learner.kind
     if self.query_delay and learner in _WITHOUT_DELAY:
       raise ValueError(
@@ -67,18 +43,10 @@ class ValueAdvice(base.Provider):
           ' is 0, or another learner'
       )
 
-  @property
-  def required_senses(self) -> tuple[str, ...]:
-    return self.adviser.required_senses
-
-  @property
-  def privileged_senses(self) -> tuple[str, ...]:
-    return self.adviser.privileged_senses
-
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
-    num_actions = len(self.adviser.action_set)
+    num_actions = len(self.action_set)
     return (
-        self.adviser.initial_state(batch_shape),
+        super().initial_state(batch_shape),
         np.zeros((*batch_shape, num_actions)),  # The previous step's values.
         np.zeros(batch_shape, int),  # The previous step's query.
     )
@@ -92,7 +60,7 @@ class ValueAdvice(base.Provider):
       state: Any,
   ) -> tuple[dict[str, np.ndarray], Any]:
     inner, values_before, query_before = state
-    values, inner = self.adviser.step(observation, episode_start, key, inner)
+    values, inner = self.followed.step(observation, episode_start, key, inner)
     query = queries.index(readings[self.reads[0]], values.shape[-1])
     if self.query_delay:
       # The first step has no previous query.
