@@ -3,7 +3,8 @@
 Actors for batches are in `batch_actors`.
 """
 
-from collections.abc import Callable, Mapping
+import abc
+from collections.abc import Callable, Collection, Mapping
 from typing import Any, Protocol, final
 
 import dm_env
@@ -55,24 +56,29 @@ class PlainActor:
     return self._policy(time_step)
 
 
-@final
-class PolicyActor:
-  """An actor that runs one of this package's policies.
+class PolicyRunner(abc.ABC):  # noqa: B024 - A subclass begins episodes.
+  """Base class of actors that run one of this package's policies.
 
   Policies return action indices. Where the environment has another action set,
   the actor converts the index to that of the same action, and where it takes
   vectors, to a vector. Query registers get the index of the action taken, or of
-  one drawn independently, depending on `query_policy` of the design's learner.
+  one drawn independently.
   """
 
   def __init__(
-      self, policy: policies.Policy, env: environment.Environment
+      self,
+      policy: policies.Policy,
+      env: Any,
+      queries: Collection[str] | None = None,
   ) -> None:
-    """Makes an actor.
+    """Prepares an actor; a subclass calls `_begin`.
 
     Args:
       policy: The policy.
-      env: Environment to act in.
+      env: Environment with one world or a batch.
+      queries: Query registers that hold the action taken; the others hold
+        independent actions. `None` for the query policy of the design's
+        learner.
 
     Raises:
       SpecError: If the action sets of the policy and the environment differ, or
@@ -80,50 +86,75 @@ class PolicyActor:
     """
     self._privileged = PrivilegedSenses(policy, env)
     self._policy = policy = policy.in_action_set(env.action_set)
-    self._seed, self._world = env.seed, env.world
-    design = env.mechanism.design
+    mechanism = env.mechanism
+    design = mechanism.design
     self._action_set, self._indices = translation(policy, design)
-    self._queries = Queries(env.mechanism, len(self._action_set))
-    self._query_policy = query_policy(design)
+    self._queries = Queries(mechanism, len(self._action_set))
     self._dtype = env.action_spec().dtype
+    if queries is None:
+      is_taken = query_policy(design) == TAKEN_ACTION
+      queries = design.names('query') if is_taken else ()
+    self._holds_taken = [one.name in queries for one in mechanism.queries]
     self._table = None
     if design.action_set is None:
-      names, number = env.action_spec().name, len(env.mechanism.queries)
+      names, number = env.action_spec().name, self._queries.number
       self._table = action_table(self._action_set, names, number)
+
+  def _begin(self, keys: np.ndarray, query_keys: np.ndarray) -> None:
+    """Begins an episode in each world, with random keys, `(..., 2)`."""
+    self._keys, self._query_keys = keys, query_keys
+    self._state = self._policy.initial_state(keys.shape[:-1])
+    self._step = 0
+
+  def act(self, time_step: Any) -> Any:
+    """Returns actions, `(..., *action_spec.shape)`."""
+    chosen, self._state = self._policy.step(
+        self._privileged.added_to(time_step.observation),
+        np.full(self._keys.shape[:-1], self._step == 0),
+        random_keys.of_step(self._keys, self._step),
+        self._state,
+    )
+    indices = self._indices[chosen]
+    actions = indices if self._table is None else self._table[indices]
+    if self._queries.number:
+      query_values = np.where(
+          self._holds_taken,
+          self._queries.values(indices),
+          self._queries.values(self._independent()),
+      )
+      rest = np.reshape(actions, (*indices.shape, -1))
+      actions = np.concatenate([query_values, rest], axis=-1)
+      actions = actions.astype(self._dtype)
+    self._step += 1
+    return actions
+
+  def _independent(self) -> np.ndarray:
+    """Returns indices of actions drawn independently, `(...)`."""
+    keys = random_keys.of_step(self._query_keys, self._step)
+    drawn = random_keys.uniform(keys) * len(self._action_set)
+    return np.asarray(drawn, int)
+
+
+@final
+class PolicyActor(PolicyRunner):
+  """An actor that runs one of this package's policies in one world."""
+
+  def __init__(
+      self, policy: policies.Policy, env: environment.Environment
+  ) -> None:
+    """Makes an actor; see `PolicyRunner`."""
+    super().__init__(policy, env)
+    self._seed, self._world = env.seed, env.world
     self.begin(0)
 
   def begin(self, episode: int) -> None:
     """Resets the policy and selects the random streams of an episode."""
-    self._key = seeding.episode_key(self._seed, self._world, episode, 'policy')
-    self._query_key = seeding.episode_key(
-        self._seed, self._world, episode, 'query'
+    self._begin(
+        *(
+            seeding.episode_key(self._seed, self._world, episode, name)
+            for name in ('policy', 'query')
+        )
     )
-    self._state = self._policy.initial_state(())
-    self._step = 0
-
-  def act(self, time_step: dm_env.TimeStep) -> Any:
-    chosen, self._state = self._policy.step(
-        self._privileged.added_to(time_step.observation),
-        np.asarray(self._step == 0),
-        random_keys.of_step(self._key, self._step),
-        self._state,
-    )
-    index = int(self._indices[int(chosen)])
-    action: Any = np.int32(index)
-    if self._table is not None:
-      action = self._table[index]
-    if self._queries.number:
-      query_values = self._queries.values(np.asarray(self._query_action(index)))
-      action = np.append(query_values, action).astype(self._dtype)
-    self._step += 1
-    return action
-
-  def _query_action(self, taken: int) -> int:
-    """Returns the index of the action to query."""
-    if self._query_policy == TAKEN_ACTION:
-      return taken
-    key = random_keys.of_step(self._query_key, self._step)
-    return int(random_keys.uniform(key) * len(self._action_set))
 
 
 @final
