@@ -6,10 +6,10 @@ import math
 from typing import Any, Final, final
 
 import numpy as np
-import pydantic
 
 from realab_suite.audit import aiming
 from realab_suite.audit import episodes
+from realab_suite.config import validation
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import hacking
@@ -26,9 +26,6 @@ UNDECIDED: Final = 'UNDECIDED'
 
 # Smallest displacement of a block that is reported, in m.
 _LEAST_METRES = 0.01
-_FROZEN = pydantic.ConfigDict(
-    frozen=True, extra='forbid', ser_json_inf_nan='strings'
-)
 
 
 @final
@@ -63,7 +60,7 @@ class Comparison:
 
 
 @final
-class MovedBlock(pydantic.BaseModel):
+class MovedBlock(validation.Record):
   """Movement of a block by a plan, as means over worlds.
 
   Attributes:
@@ -72,8 +69,6 @@ class MovedBlock(pydantic.BaseModel):
     metres: Largest distance from where the reset and the writes put it.
     held_steps: Number of steps in which the hand held it.
   """
-
-  model_config = _FROZEN
 
   target: str
   block: str
@@ -88,7 +83,7 @@ class MovedBlock(pydantic.BaseModel):
 
 
 @final
-class Figures(pydantic.BaseModel):
+class Figures(validation.Record):
   """Figures of a plan or of the solver, in the worlds of a comparison.
 
   Attributes:
@@ -100,8 +95,6 @@ class Figures(pydantic.BaseModel):
     observed_return: Mean sum of the readings of feedback registers.
     true_return: Mean true return.
   """
-
-  model_config = _FROZEN
 
   hacked: int
   ended: int
@@ -145,7 +138,7 @@ def _gains(
 
 
 @final
-class Audit(pydantic.BaseModel):
+class Audit(validation.Record):
   """Result of an audit.
 
   Attributes:
@@ -172,8 +165,6 @@ class Audit(pydantic.BaseModel):
     comparison_seed: Seed of the worlds of the comparison.
     film_world: World of the comparison with a typical hacked episode.
   """
-
-  model_config = _FROZEN
 
   verdict: str
   reasons: tuple[str, ...]

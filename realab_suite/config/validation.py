@@ -58,6 +58,17 @@ class Model(pydantic.BaseModel, abc.ABC):
     return data
 
 
+class Record(pydantic.BaseModel, abc.ABC):
+  """Base class of results: frozen and without unknown keys.
+
+  Infinite figures and nan are strings in JSON.
+  """
+
+  model_config = pydantic.ConfigDict(
+      frozen=True, extra='forbid', ser_json_inf_nan='strings'
+  )
+
+
 class Spec(Model):
   """Base class of specs, which identify results."""
 

@@ -5,11 +5,12 @@ import dataclasses
 from typing import final
 
 import numpy as np
-import pydantic
+
+from realab_suite.config import validation
 
 
 @final
-class AttributionMetrics(pydantic.BaseModel):
+class AttributionMetrics(validation.Record):
   """Summary of the attribution of one episode.
 
   Figures in metres (radians where a register stores an angle) are means over
@@ -23,11 +24,6 @@ class AttributionMetrics(pydantic.BaseModel):
     agent_share: Agent divided by agent plus world; `None` without own
       corruption.
   """
-
-  # Rows are validated in the same way as other metrics.
-  model_config = pydantic.ConfigDict(
-      frozen=True, extra='forbid', ser_json_inf_nan='strings'
-  )
 
   total: float | None
   agent: float | None

@@ -20,8 +20,8 @@ import math
 from typing import Any, final
 
 import numpy as np
-import pydantic
 
+from realab_suite.config import validation
 from realab_suite.engine import events
 from realab_suite.entities import registers
 from realab_suite.evaluation import gains
@@ -29,13 +29,9 @@ from realab_suite.feedback import clean_contents
 from realab_suite.feedback import objectives
 from realab_suite.feedback import specs
 
-_FROZEN = pydantic.ConfigDict(
-    frozen=True, extra='forbid', ser_json_inf_nan='strings'
-)
-
 
 @final
-class RegisterFigures(pydantic.BaseModel):
+class RegisterFigures(validation.Record):
   """Corruption and coverage of one register in one episode.
 
   Means are over control steps with a read that follows a write, and `None`
@@ -56,8 +52,6 @@ class RegisterFigures(pydantic.BaseModel):
     coverage: Share of the writes that were read; others are censored. `None`
       without writes.
   """
-
-  model_config = _FROZEN
 
   corruption: float | None
   units: float | None

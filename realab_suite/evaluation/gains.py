@@ -15,10 +15,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, final
 
 import numpy as np
-import pydantic
 
 from realab_suite import errors
 from realab_suite.config import messages
+from realab_suite.config import validation
 from realab_suite.engine import events
 from realab_suite.entities import registers
 from realab_suite.feedback import clean_contents
@@ -102,7 +102,7 @@ def parts(objective: objectives.ObjectiveSpec | None) -> tuple[Part, ...]:
 
 
 @final
-class Value(pydantic.BaseModel):
+class Value(validation.Record):
   """Value of a part of the objective in an episode.
 
   Attributes:
@@ -110,10 +110,6 @@ class Value(pydantic.BaseModel):
     clean: Its value on the clean contents; nan if they are unknown, because a
       provider failed.
   """
-
-  model_config = pydantic.ConfigDict(
-      frozen=True, extra='forbid', ser_json_inf_nan='strings'
-  )
 
   observed: float
   clean: float

@@ -20,6 +20,7 @@ import pydantic
 
 from realab_suite import __version__
 from realab_suite import errors
+from realab_suite.config import validation
 from realab_suite.engine import events
 from realab_suite.evaluation import attribution_metrics
 from realab_suite.evaluation import endings
@@ -54,13 +55,10 @@ UNITS = {
 
 # Rows may contain nan, for example the true return of an invalid episode. JSON
 # has no nan, so it is written as a string.
-_FROZEN = pydantic.ConfigDict(
-    frozen=True, extra='forbid', ser_json_inf_nan='strings'
-)
 
 
 @final
-class RunInfo(pydantic.BaseModel):
+class RunInfo(validation.Record):
   """Settings that all episodes of a run share.
 
   Attributes:
@@ -84,8 +82,6 @@ class RunInfo(pydantic.BaseModel):
     versions: Versions of the packages that results depend on.
     platform: Operating system and processor of the machine.
   """
-
-  model_config = _FROZEN
 
   domain: str
   task: str
@@ -134,19 +130,14 @@ class RunInfo(pydantic.BaseModel):
 
 
 @final
-class EpisodeRow(pydantic.BaseModel):
+class EpisodeRow(validation.Record):
   """Result of one episode, with the settings of its run.
 
   The attributes are those of `monitors.EpisodeResult`, the settings in `info`,
   `units`, and the stakes of the design, `None` if there are none.
   """
 
-  model_config = pydantic.ConfigDict(
-      frozen=True,
-      extra='forbid',
-      ser_json_inf_nan='strings',
-      populate_by_name=True,
-  )
+  model_config = pydantic.ConfigDict(populate_by_name=True)
 
   schema_version: Literal[3] = pydantic.Field(SCHEMA, alias='schema')
   info: RunInfo

@@ -19,7 +19,6 @@ import math
 from typing import Any, Final, NamedTuple, final
 
 import numpy as np
-import pydantic
 from scipy import stats
 
 from realab_suite import errors
@@ -41,9 +40,6 @@ SEED: Final = 0
 
 # Share of the estimate that the lower end of its interval must exceed.
 _LEAST_SHARE = 0.1
-_FROZEN = pydantic.ConfigDict(
-    frozen=True, extra='forbid', ser_json_inf_nan='strings'
-)
 
 LoadBatch = Callable[
     [specs.DesignSpec, int, int], batch_environment.BatchEnvironment
@@ -52,7 +48,7 @@ LoadBatch = Callable[
 
 
 @final
-class Stake(pydantic.BaseModel):
+class Stake(validation.Record):
   """Stake of one part of an objective.
 
   Attributes:
@@ -63,8 +59,6 @@ class Stake(pydantic.BaseModel):
     is_confirmed: False if the solver does not clearly earn more than that in
       the world where the design is judged.
   """
-
-  model_config = _FROZEN
 
   estimate: float
   low: float
@@ -79,15 +73,13 @@ class Stake(pydantic.BaseModel):
 
 
 @final
-class Stakes(pydantic.BaseModel):
+class Stakes(validation.Record):
   """Stakes of a design in a domain.
 
   Attributes:
     key: Digest of everything that they depend on; see `key_of`.
     parts: Stake of each part of the objective, by name.
   """
-
-  model_config = _FROZEN
 
   key: str
   parts: dict[str, Stake]
