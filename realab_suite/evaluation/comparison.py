@@ -49,15 +49,12 @@ class RunSummary:
     return bool(self.num_given_up or self.num_failed)
 
 
-def summary(
-    name: str, episodes: Sequence[Episode], *, level: float = 0.95
-) -> RunSummary:
+def summary(name: str, episodes: Sequence[Episode]) -> RunSummary:
   """Returns the figures of a run.
 
   Args:
     name: Name of the run, for messages.
     episodes: Its episodes.
-    level: Confidence level of the intervals.
 
   Raises:
     ResultsError: If no episode counts, or two records of one differ.
@@ -74,16 +71,10 @@ def summary(
       num_episodes=len(counting),
       num_given_up=sum(not episode.is_valid for episode in counting),
       num_failed=len(episodes) - len(counting),
-      true_return=_mean(
-          counting, 'true_return', return_bounds(counting), level
-      ),
-      observed_return=_mean(
-          counting, 'observed_return', intervals.UNBOUNDED, level
-      ),
+      true_return=_mean(counting, 'true_return', return_bounds(counting)),
+      observed_return=_mean(counting, 'observed_return', intervals.UNBOUNDED),
       corruption=(
-          _mean(read, 'corruption', intervals.NOT_NEGATIVE, level)
-          if read
-          else None
+          _mean(read, 'corruption', intervals.NOT_NEGATIVE) if read else None
       ),
   )
 
@@ -92,8 +83,6 @@ def gained(
     name: str,
     episodes: Sequence[Episode],
     others: Sequence[Episode],
-    *,
-    level: float = 0.95,
 ) -> intervals.Interval:
   """Returns the true return of a run minus that of another one, in pairs.
 
@@ -101,7 +90,6 @@ def gained(
     name: Name of the run, for messages.
     episodes: Its episodes.
     others: Episodes of the other run.
-    level: Confidence level of the interval.
 
   Raises:
     ResultsError: If the runs do not have the same seeds and episodes, or no
@@ -120,7 +108,6 @@ def gained(
           if low is None or high is None
           else (low - high, high - low)
       ),
-      level=level,
   )
 
 
@@ -214,10 +201,6 @@ def _pairs(
 
 
 def _mean(
-    episodes: Sequence[Episode],
-    attribute: str,
-    bounds: intervals.Bounds,
-    level: float,
+    episodes: Sequence[Episode], attribute: str, bounds: intervals.Bounds
 ) -> intervals.Interval:
-  values = by_seed(episodes, attribute)
-  return intervals.mean_interval(values, bounds=bounds, level=level)
+  return intervals.mean_interval(by_seed(episodes, attribute), bounds=bounds)

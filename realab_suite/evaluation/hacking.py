@@ -257,8 +257,6 @@ def hacking(
     episodes: Sequence[comparison.Episode],
     beside: Control,
     stake: stakes.Stakes,
-    *,
-    level: float = 0.95,
 ) -> Hacking | None:
   """Returns the figures of hacked episodes.
 
@@ -266,7 +264,6 @@ def hacking(
     episodes: Episodes of the run. Those that do not count are left out.
     beside: Its control.
     stake: Stakes of the design.
-    level: Confidence level of the intervals.
 
   Returns:
     The figures, or `None` if no episode counts.
@@ -291,19 +288,16 @@ def hacking(
     hack_free_return = intervals.mean_interval(
         comparison.by_seed(free, 'true_return'),
         bounds=comparison.return_bounds(counting),
-        level=level,
     )
   return Hacking(
       control=beside,
-      rate=intervals.mean_interval(
-          is_hacked, bounds=intervals.SHARE, level=level
-      ),
+      rate=intervals.mean_interval(is_hacked, bounds=intervals.SHARE),
       hack_free_return=hack_free_return,
       by_seed={
           seed: count(of_seed, stake, beside.limit)
           for seed, of_seed in by_seed.items()
       },
-      relative_gain=intervals.mean_interval(relative, level=level),
+      relative_gain=intervals.mean_interval(relative),
   )
 
 

@@ -103,21 +103,17 @@ class Stakes(validation.Record):
         if not (one.is_degenerate or one.is_confirmed)
     ]
 
-  def relative_gain(
-      self, objective: Mapping[str, gains.Value], end: str = 'estimate'
-  ) -> float | None:
+  def relative_gain(self, objective: Mapping[str, gains.Value]) -> float | None:
     """Returns the relative gain of an episode: the largest over its parts.
 
     Args:
       objective: Value of each part of the objective, by name.
-      end: 'estimate' of the stakes, or 'low' or 'high' for an end of their
-        intervals.
 
     Returns:
       The relative gain; nan if it is unknown, and `None` if no part has a stake
       that is not degenerate, or without control steps.
     """
-    found = self._relative_gains(objective, end)
+    found = self._relative_gains(objective, 'estimate')
     if any(map(math.isnan, found)):
       return math.nan
     return max(found, default=None)
@@ -131,7 +127,8 @@ class Stakes(validation.Record):
 
     Args:
       objective: Value of each part of the objective, by name.
-      end: As for `relative_gain`.
+      end: 'estimate' of the stakes, or 'low' or 'high' for an end of their
+        intervals.
     """
     found = self._relative_gains(objective, end)
     return max((x for x in found if not math.isnan(x)), default=-math.inf)

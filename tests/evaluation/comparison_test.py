@@ -15,18 +15,18 @@ from tests.evaluation import episodes
 _RUN = episodes.run()
 
 
-def _summary(run, **kwargs):
-  return comparison.summary('ours', run, **kwargs)
+def _summary(run):
+  return comparison.summary('ours', run)
 
 
-def _gained(ours, theirs=_RUN, **kwargs):
-  return comparison.gained('ours', ours, theirs, **kwargs)
+def _gained(ours, theirs=_RUN):
+  return comparison.gained('ours', ours, theirs)
 
 
 def test_figures_are_means_over_seeds_of_their_own_kind():
   noise = episodes.noise
   run = episodes.run(noise(1.0, 5.0), noise(0.1, 1.0), noise(2.0, 30.0))
-  found = _summary(run, level=0.9)
+  found = _summary(run)
   assert (found.num_seeds, found.num_episodes) == (10, 20)
   assert (found.num_given_up, found.num_failed) == (0, 0)
   assert not found.is_censored
@@ -34,10 +34,10 @@ def test_figures_are_means_over_seeds_of_their_own_kind():
       (found.true_return, 5.0),
       (found.observed_return, 30.0),
       (found.corruption, 1.0),
-      (_gained(run, level=0.9), -5.0),
+      (_gained(run), -5.0),
   ):
     assert interval.estimate == pytest.approx(mean)
-    assert interval.level == 0.9
+    assert interval.level == 0.95
 
 
 def test_failed_episodes_are_counted_and_not_used():
