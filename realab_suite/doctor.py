@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from importlib import metadata
 import os
 import platform
-import subprocess
 import sys
 from typing import NamedTuple, final
 
@@ -26,8 +25,6 @@ _PACKAGES = (
     'numpy',
     'pydantic',
 )
-# Enough time to import everything on a slow machine under load.
-_PATIENCE_SECONDS = 300
 _STEPS_A_WORLD = """
 from realab_suite import suite
 env = suite.load('unlock_door', 'near', {'random': 0},
@@ -99,28 +96,6 @@ def versions() -> str:
   return ', '.join(found)
 
 
-def _core_problem() -> str:
-  """Loads and steps a world in a process that may crash.
-
-  Returns:
-    The problem, or '' if there is none.
-  """
-  try:
-    ran = subprocess.run(
-        [sys.executable, '-c', _STEPS_A_WORLD],
-        capture_output=True,
-        text=True,
-        timeout=_PATIENCE_SECONDS,
-        check=False,
-    )
-  except subprocess.TimeoutExpired:
-    return f'no step within {_PATIENCE_SECONDS} s'
-  if not ran.returncode:
-    return ''
-  complaint = ran.stderr.strip().splitlines()
-  return complaint[-1] if complaint else f'exit status {ran.returncode}'
-
-
 def _tell(name: str, text: str, remedy: str = '') -> None:
   """Prints the result of a check, with a remedy if something does not work."""
   sys.stdout.write(f'{"--" if remedy else "ok"}  {name:10} {text}\n')
@@ -136,7 +111,7 @@ def main() -> int:
     0 if the core works, otherwise 1.
   """
   sys.stdout.write(f'{versions()}\n')
-  core = _core_problem()
+  core = renderers.problem_of(_STEPS_A_WORLD, 'step', os.environ)
   if core:
     _tell('core', f'cannot step a world: {core}', _CORE_REMEDY)
   else:

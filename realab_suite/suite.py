@@ -16,6 +16,7 @@ import numpy as np
 
 from realab_suite import errors
 from realab_suite import tasks
+from realab_suite.config import integers
 from realab_suite.config import loading
 from realab_suite.config import messages
 from realab_suite.engine import arguments
@@ -336,9 +337,10 @@ def embed(
         f'task: {type(task).__name__} has {len(task.observables)} agents;'
         ' allowed are tasks with one agent'
     )
-  world = arguments.world(world)
+  world = integers.check('world', world, 0)
   seed = seeding.as_seed(random)
-  max_steps = arguments.max_steps(max_steps)
+  if max_steps is not None:
+    max_steps = integers.check('max_steps', max_steps, 1, more=', and None')
   senses = arguments.senses(senses)
   measurements = _keywords('measurements', measurements)
   for name, measure in measurements.items():

@@ -36,15 +36,6 @@ def num_threads(given: Any) -> int:
   return integers.check('num_threads', given, 0, _MAX_THREADS)
 
 
-def world(given: Any) -> int:
-  """Returns the number of a world as an integer.
-
-  Raises:
-    SpecError: If it is not an integer from 0 to 2**63 - 1.
-  """
-  return integers.check('world', given, 0)
-
-
 def indices(given: Any, num_envs: int) -> np.ndarray:
   """Returns indices of worlds in a batch, `(indices,)` int.
 
@@ -93,17 +84,6 @@ def sources(given: Any, number: int, has_begun: np.ndarray) -> np.ndarray:
         ' worlds that have begun an episode'
     )
   return found
-
-
-def max_steps(given: Any) -> int | None:
-  """Returns the number of control steps per episode; `None` for no limit.
-
-  Raises:
-    SpecError: If it is neither a positive integer nor `None`.
-  """
-  if given is None:
-    return None
-  return integers.check('max_steps', given, 1, more=', and None')
 
 
 def senses(given: Any) -> tuple[str, ...] | None:

@@ -3,6 +3,7 @@
 Both read `MUJOCO_GL` only once, so this module does not import them.
 """
 
+from collections.abc import Mapping
 import importlib
 import os
 import subprocess
@@ -12,7 +13,7 @@ from realab_suite import _display
 from realab_suite import errors
 from realab_suite.experiments import requirements
 
-# Enough time to import dm_control and render on a slow machine under load.
+# Enough time to import everything on a slow machine under load.
 _PATIENCE_SECONDS = 300
 # Runs in a separate process, because imports fail midway if libraries are
 # missing.
@@ -33,8 +34,12 @@ def choose_renderer() -> str | None:
   """
   problems = []
   for renderer in _candidates():
-    problem = _problem(renderer)
-    if problem is None:
+    if renderer == 'disable':
+      problem = 'rendering is turned off by MUJOCO_GL'
+    else:
+      env = {**os.environ, 'MUJOCO_GL': renderer}
+      problem = problem_of(_RENDERS_SOMETHING, 'picture', env)
+    if not problem:
       _name(renderer)
       return None
     problems.append(f'{renderer}: {problem}')
@@ -96,22 +101,29 @@ def _candidates() -> list[str]:
   return ['glfw', 'egl'] if _display.has_display() else ['egl']
 
 
-def _problem(renderer: str) -> str | None:
-  """Returns the problem of a renderer, in one line, or `None`."""
-  if renderer == 'disable':
-    return 'rendering is turned off by MUJOCO_GL'
+def problem_of(source: str, aim: str, env: Mapping[str, str]) -> str:
+  """Runs source text in a process that may crash.
+
+  Args:
+    source: The text.
+    aim: What it makes, for the problem.
+    env: Environment variables of the process.
+
+  Returns:
+    The problem, in one line, or '' if there is none.
+  """
   try:
     ran = subprocess.run(
-        [sys.executable, '-c', _RENDERS_SOMETHING],
-        env={**os.environ, 'MUJOCO_GL': renderer},
+        [sys.executable, '-c', source],
+        env=env,
         capture_output=True,
         text=True,
         timeout=_PATIENCE_SECONDS,
         check=False,
     )
   except subprocess.TimeoutExpired:
-    return f'no picture within {_PATIENCE_SECONDS} s'
+    return f'no {aim} within {_PATIENCE_SECONDS} s'
   if not ran.returncode:
-    return None
+    return ''
   complaint = ran.stderr.strip().splitlines()
   return complaint[-1] if complaint else f'exit status {ran.returncode}'
