@@ -10,6 +10,7 @@ from realab_suite import policies
 from realab_suite import suite
 from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
+from realab_suite.evaluation import gains
 from realab_suite.evaluation import obstacles
 from realab_suite.evaluation import stakes
 from realab_suite.feedback import specs
@@ -206,17 +207,20 @@ def obstacles_of(
 def coincides(world: World, design: specs.DesignSpec) -> bool:
   """Returns True if physics changes registers through blocks of the task.
 
-  Corruption is then a part of the task; see `verdicts.coincidence`.
+  Corruption is then a part of the task; see `verdicts.coincidence`. Registers
+  that the objective does not depend on do not matter.
 
   Args:
     world: The world.
     design: The design.
   """
+  ports = gains.relevant(design, are_only_read=True)
+  relevant = {design.register_of(port) for port in ports}
   with contextlib.closing(world.load(design, stakes.SEED)) as env:
     return any(
         len(register.own_blocks) < len(register.blocks)
         for name, register in env.mechanism.registers.items()
-        if design.channel_of(name) == 'embedded'
+        if name in relevant and design.channel_of(name) == 'embedded'
     )
 
 

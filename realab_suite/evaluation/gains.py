@@ -40,7 +40,9 @@ def consumed(design: specs.DesignSpec) -> tuple[str, ...]:
   return tuple(design.names('feedback'))
 
 
-def relevant(design: specs.DesignSpec) -> tuple[str, ...]:
+def relevant(
+    design: specs.DesignSpec, *, are_only_read: bool = False
+) -> tuple[str, ...]:
   """Returns the names of the registers that decide what the learner consumes.
 
   They are the consumed registers, those that their providers read or see, and
@@ -48,6 +50,8 @@ def relevant(design: specs.DesignSpec) -> tuple[str, ...]:
 
   Args:
     design: Design of the agent.
+    are_only_read: True to leave out what providers see as agents do, and do not
+      declare to read.
   """
   found = {
       *consumed(design),
@@ -56,7 +60,11 @@ def relevant(design: specs.DesignSpec) -> tuple[str, ...]:
   for _ in design.providers:  # As many turns as the longest chain may take.
     for provider in design.providers:
       if found.intersection(provider.writes):
-        found.update(specs.inputs_of(provider, design))
+        found.update(
+            provider.reads
+            if are_only_read
+            else specs.inputs_of(provider, design)
+        )
   return tuple(name for name in design.ports if name in found)
 
 

@@ -46,6 +46,50 @@ def test_a_register_at_a_crate_coincides_unless_it_is_secure(
   assert worlds.coincides(_TIDY, spec) == coincides
 
 
+_DECLARED = {
+    'tidy_1': 'meter',  # No provider reads it any more.
+    'kept': 'memory',
+    'shown': 'feedback',
+    'bell': 'signal',
+}
+
+
+@pytest.mark.parametrize(
+    ('at_the_crate', 'reads', 'rewards', 'coincides'),
+    [
+        ('tidy_1', ['tidy_2', 'tidy_3'], ['reward'], False),
+        ('tidy_1', ['tidy_2', 'tidy_1'], ['reward'], True),
+        ('kept', ['tidy_2'], ['reward'], False),
+        ('kept', ['tidy_2', 'kept'], ['reward'], True),
+        # Agents see it, and so providers may, but nobody is paid for it.
+        ('shown', ['tidy_4'], ['reward'], False),
+        ('shown', ['tidy_4'], ['shown'], True),
+        ('shown', ['tidy_4', 'shown'], ['reward'], True),
+        # It ends episodes, whatever the learner consumes.
+        ('bell', ['tidy_4'], ['reward'], True),
+    ],
+)
+def test_only_registers_that_the_objective_depends_on_coincide(
+    at_the_crate, reads, rewards, coincides
+):
+  data = specs.load('tidy_up', ('dof=planar',)).to_mapping()
+  for i, (name, role) in enumerate(_DECLARED.items()):
+    place = 'crate_2' if name == at_the_crate else [3.0, 0.5 * i]
+    spec = {'kind': 'two_block', 'role': role, 'range': [0, 2], 'scale': 0.1}
+    if role == 'signal':
+      spec['ends_episode'] = {'above': 1.5}
+    data['registers'][name] = {**spec, 'place': place}
+  data['providers'] = [
+      {'kind': 'relay', 'reads': ['tidy_3'], 'writes': ['kept']},
+      {'kind': 'growth', 'reads': reads, 'writes': ['reward']},
+      {'kind': 'constant', 'value': 1.0, 'writes': ['shown']},
+      {'kind': 'constant', 'value': 0.0, 'writes': ['bell']},
+  ]
+  [paid] = rewards
+  data['learner'] = {'kind': 'policy_gradient', 'reward': paid}
+  assert worlds.coincides(_TIDY, specs.load(data)) == coincides
+
+
 def test_the_gain_stands_beside_that_of_the_solver():
   agent = scorecard_rows.rows('a', {0: [1] * 4}, gain=9)
   agent += scorecard_rows.rows('a', {1: [1] * 4}, gain=11)
