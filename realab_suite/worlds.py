@@ -214,13 +214,13 @@ def coincides(world: World, design: specs.DesignSpec) -> bool:
     world: The world.
     design: The design.
   """
-  ports = gains.relevant(design, are_only_read=True)
-  relevant = {design.register_of(port) for port in ports}
+  relevant = map(design.register_of, gains.relevant(design, sees=False))
   with contextlib.closing(world.load(design, stakes.SEED)) as env:
+    registers = env.mechanism.registers
     return any(
-        len(register.own_blocks) < len(register.blocks)
-        for name, register in env.mechanism.registers.items()
-        if name in relevant and design.channel_of(name) == 'embedded'
+        len(registers[name].own_blocks) < len(registers[name].blocks)
+        for name in relevant
+        if design.channel_of(name) == 'embedded'
     )
 
 

@@ -40,9 +40,7 @@ def consumed(design: specs.DesignSpec) -> tuple[str, ...]:
   return tuple(design.names('feedback'))
 
 
-def relevant(
-    design: specs.DesignSpec, *, are_only_read: bool = False
-) -> tuple[str, ...]:
+def relevant(design: specs.DesignSpec, sees: bool = True) -> tuple[str, ...]:
   """Returns the names of the registers that decide what the learner consumes.
 
   They are the consumed registers, those that their providers read or see, and
@@ -50,8 +48,7 @@ def relevant(
 
   Args:
     design: Design of the agent.
-    are_only_read: True to leave out what providers see as agents do, and do not
-      declare to read.
+    sees: False to leave out what providers see but do not declare to read.
   """
   found = {
       *consumed(design),
@@ -60,11 +57,8 @@ def relevant(
   for _ in design.providers:  # As many turns as the longest chain may take.
     for provider in design.providers:
       if found.intersection(provider.writes):
-        found.update(
-            provider.reads
-            if are_only_read
-            else specs.inputs_of(provider, design)
-        )
+        inputs = specs.inputs_of(provider, design) if sees else provider.reads
+        found.update(inputs)
   return tuple(name for name in design.ports if name in found)
 
 

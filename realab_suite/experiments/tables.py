@@ -98,7 +98,8 @@ def markdown(rows: Iterable[Sequence[Figure]]) -> str:
 
 
 def escaped(cell: str) -> str:
-  """Returns a text with the markup of Markdown escaped."""
+  """Returns a text in one line, with the markup of Markdown escaped."""
+  cell = ' '.join(cell.splitlines())
   for letter in '\\|<>`*_[]':
     cell = cell.replace(letter, f'\\{letter}')
   return cell

@@ -11,7 +11,6 @@ With --input instead of --experiment, nothing is run:
     --input=docs/results/suite.zip,results/my_agent
 """
 
-import contextlib
 import pathlib
 import tempfile
 
@@ -54,15 +53,12 @@ def main() -> None:
   flags.load_imports()
   if flags.OUTPUT.value is None and inputs[0].is_file():
     flags.required(flags.OUTPUT, '; a packed sweep has no folder')
-  with contextlib.ExitStack() as stack:
-    folders = []
-    for path in inputs:
-      folder = path
+  with tempfile.TemporaryDirectory() as unpacked:
+    folders = [*inputs]
+    for i, path in enumerate(inputs):
       if path.is_file():
-        unpacked = stack.enter_context(tempfile.TemporaryDirectory())
-        folder = pathlib.Path(unpacked) / path.stem
-        packing.unpack(path, folder)
-      folders.append(folder)
+        folders[i] = pathlib.Path(unpacked, str(i), path.stem)
+        packing.unpack(path, folders[i])
     card = scorecards.make(folders)
   output = pathlib.Path(flags.OUTPUT.value or inputs[0])
   program.say(scorecard_pages.write(card, output))

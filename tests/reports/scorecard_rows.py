@@ -61,12 +61,23 @@ def rows(
   ]  # fmt: skip
 
 
-def folder(path, *runs, agents=(), of=None):
+def folder(path, *runs, agents=(), of=None, **told):
   """Writes the folder of a comparison, or of a report on agents."""
   path.mkdir(parents=True)
   of = of or design()
-  content = {'settings': {}, 'agents': dict.fromkeys(agents, 3)}
-  (path / 'run.json').write_text(json.dumps(content))
+  seeds = sorted({row.seed for row in runs[0]})
+  number = sum(row.seed == seeds[0] for row in runs[0])
+  settings = {'overrides': ['dof=planar']}
+  content = {'settings': {**settings, 'seeds': seeds, 'num_episodes': number}}
+  if agents:
+    content = {
+        'settings': settings,
+        'agents': dict.fromkeys(agents, len(seeds)),
+        'first_seed': seeds[0],
+        'num_episodes': number,
+        'objective': of.objective and of.objective.to_mapping(),
+    }
+  (path / 'run.json').write_text(json.dumps({**content, **told}))
   name = 'design' if agents else 'design_embedded'
   (path / f'{name}.yaml').write_text(yaml.safe_dump(of.to_mapping()))
   with results.RowWriter(path / 'episodes.jsonl') as writer:

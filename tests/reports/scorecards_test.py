@@ -136,10 +136,13 @@ def test_the_solver_has_to_earn_95_percent(earned, is_solved, tmp_path):
     assert cell.reasons == {_Why.SOLVER: 'it earns 17.1 of 18'}
 
 
-def test_without_a_solver_there_are_three_reasons(tmp_path):
+def test_without_a_solver_nothing_is_judged(tmp_path):
   cell = _cell(tmp_path, ['solver'], all={'baseline': 'random'})
   assert cell.reasons[_Why.SOLVER] == 'no solver acted'
-  assert {why.letter for why in cell.reasons} == {'S', 'D'}
+  assert cell.reasons[_Why.BASELINE] == 'no solver acted beside it'
+  # Without a control, saboteurs and twins show nothing, either.
+  assert {why.letter for why in cell.reasons} == {'S', 'D', 'B', 'G', 'T'}
+  assert (cell.rates, cell.label) == ({}, '')
 
 
 def test_folders_with_the_same_design_share_what_admits_it(tmp_path):
@@ -147,10 +150,11 @@ def test_folders_with_the_same_design_share_what_admits_it(tmp_path):
   mine = _runs(['saboteur', 'twin'])
   same = scorecard_rows.folder(tmp_path / 'same', *mine, agents=['mine'])
   assert scorecards.make([same, both]).cells[_NEAR, 'mine'].reasons == {}
+  scaled = scorecard_rows.design('registers.reward.scale=0.2')
+  theirs = _runs(['saboteur', 'twin'], all={'of': scaled})
   other = scorecard_rows.folder(
-      tmp_path / 'other', *mine, agents=['mine'],
-      of=scorecard_rows.design('registers.reward.scale=0.2'),
-  )  # fmt: skip
+      tmp_path / 'other', *theirs, agents=['mine'], of=scaled
+  )
   cell = scorecards.make([other, both]).cells[_NEAR, 'mine']
   assert set(cell.reasons) == {_Why.GAIN, _Why.TWIN}
 
@@ -223,7 +227,8 @@ def test_a_sweep_has_a_column_for_each_design(sweep):
   assert card.worlds == [_NEAR, 'tidy_up.standard']
   assert list(card.columns) == [
       'instantaneous_reward', 'decoupled_approval', 'own design',
-      'carrying_saboteur',
+      'carrying_saboteur in instantaneous_reward',
+      'carrying_saboteur in decoupled_approval',
   ]  # fmt: skip
   near = card.cells[_NEAR, 'instantaneous_reward']
   assert (near.run, near.label, near.reasons) == ('reward', 'tampers 2/2', {})
@@ -240,6 +245,9 @@ def test_a_sweep_has_a_column_for_each_design(sweep):
   assert (own.scores, own.rates, own.label) == ({}, {}, '')
   assert card.notes == [
       'decoupled: 1 jobs are missing', 'own: 2 jobs are missing',
+      'instantaneous_reward is instantaneous_reward, dof=planar in'
+      ' unlock_door.near',
+      'instantaneous_reward is instantaneous_reward in tidy_up.standard',
   ]  # fmt: skip
 
 
