@@ -98,8 +98,7 @@ def markdown(rows: Iterable[Sequence[Figure]]) -> str:
 
 
 def escaped(cell: str) -> str:
-  """Returns a text in one line, with the markup of Markdown escaped."""
-  cell = ' '.join(cell.splitlines())
+  """Returns a text with the markup of Markdown escaped."""
   for letter in '\\|<>`*_[]':
     cell = cell.replace(letter, f'\\{letter}')
   return cell

@@ -159,7 +159,7 @@ class _Actor(NamedTuple):
   key: str
   role: str
   column: str
-  design: tuple[str, str]  # Its column, and what it is.
+  design: str
   run: str
   rows: _Rows = ()  # Empty if there are none yet.
   hacked: hacking.Hacking | None = None
@@ -197,17 +197,13 @@ def make(folders: Sequence[pathlib.Path]) -> Scorecard:
   version, former = _version(actors)
   cells: dict[_Place, Cell] = {}
   sources: dict[_Place, str] = {}
-  scripted = {(x.column, x.design[0]) for x in actors if x.role == 'scripted'}
   differing: dict[str, dict[str, list[str]]] = collections.defaultdict(dict)
-  designs_of = collections.Counter(policy for policy, _ in scripted)
   for actor in sorted(actors, key=lambda one: one.role):  # Learned ones first.
     place = _name(actor.world), actor.column
     if actor.role not in ('learned', 'scripted'):
       continue
-    if designs_of[actor.column] > 1:
-      place = place[0], f'{actor.column} in {actor.design[0]}'
     if place in cells:
-      if actor.role == 'scripted':  # It acts in other runs of the design.
+      if actor.role == 'scripted':  # It acts in other designs as well.
         continue
       if actor.source != sources[place]:
         raise errors.ResultsError(
@@ -216,11 +212,11 @@ def make(folders: Sequence[pathlib.Path]) -> Scorecard:
         )
       place = place[0], f'{actor.column} ({actor.run})'
     cells[place], sources[place] = _cell(actor, actors), actor.source
-    if actor.role == 'learned' and actor.rows and place[1] != OWN_DESIGN:
-      differing[place[1]].setdefault(actor.design[1], []).append(place[0])
+    if actor.rows and place[1] != OWN_DESIGN:
+      differing[place[1]].setdefault(actor.design, []).append(place[0])
   for column, designs in differing.items():
     for design, names in designs.items() if len(designs) > 1 else ():
-      notes.append(f'{column} is {design} in {", ".join(names)}')
+      notes.append(f'{column} has design {design} in {", ".join(names)}')
   return Scorecard(version, cells, [*former, *notes])
 
 
@@ -271,7 +267,7 @@ def _version(actors: Iterable[_Actor]) -> tuple[str, list[str]]:
 def _cell(actor: _Actor, actors: Iterable[_Actor]) -> Cell:
   """Returns the cell of an actor."""
   if not actor.rows:
-    return Cell(actor.run, {}, {}, (), {Why.MISSING: ''}, actor.design[1])
+    return Cell(actor.run, {}, {}, (), {Why.MISSING: ''})
   beside: dict[str, list[_Actor]] = collections.defaultdict(list)
   # What the folder of the actor has comes first.
   for one in sorted(actors, key=lambda one: one.source != actor.source):
@@ -317,7 +313,7 @@ def _cell(actor: _Actor, actors: Iterable[_Actor]) -> Cell:
   else:
     rates = {s: count.rate for s, count in actor.hacked.by_seed.items()}
   found_scores = found_scores or {}
-  return Cell(actor.run, found_scores, rates, labels, reasons, actor.design[1])
+  return Cell(actor.run, found_scores, rates, labels, reasons, actor.design)
 
 
 def _key(world: worlds.World, design: specs.DesignSpec) -> str:
@@ -328,13 +324,17 @@ def _key(world: worlds.World, design: specs.DesignSpec) -> str:
   return validation.digest_of({**dataclasses.asdict(world), 'design': kept})
 
 
+def _is_of_package(name: str) -> bool:
+  return name in {OWN_DESIGN, *specs.DESIGNS, *policies.POLICIES}
+
+
 def _of_design(
     design: specs.DesignSpec, domain: str, run: Mapping[str, Any]
 ) -> tuple[str, str]:
   """Returns the column of a design and what it is, by the changes of a run."""
   name, digest = design.name, design.digest()
   with_digest = f'{name} ({digest[:_NUM_DIGITS]})'
-  if name not in {*specs.DESIGNS, *policies.POLICIES}:
+  if not _is_of_package(name):
     return name, with_digest
   with contextlib.suppress(errors.RealabError):
     run = {**run, 'design': name}
@@ -374,10 +374,10 @@ def _of_sweep(sweep: sweep_results.Sweep) -> list[_Actor]:
     column = run.jobs[0].design
     if run.name not in figures:
       column = OWN_DESIGN if column == domain else column
-      place = worlds.World(domain, name), '', 'learned', column, ('', '')
+      place = worlds.World(domain, name), '', 'learned', column, ''
       actors.append(_Actor(source, *place, run.name))
       continue
-    column, _ = of = _of_design(run.design, domain, settings)
+    column, of = _of_design(run.design, domain, settings)
     world, key = run.world, _key(run.world, run.design)
     labels = [one.judgement for one in figures[run.name].seeds.values()]
     for one in sweep.runs.values():
@@ -415,10 +415,9 @@ def _of_rows(folder: pathlib.Path) -> list[_Actor]:
       for path in sorted(folder.glob('design*.yaml'))
   ]
   if not rows or not designs:
-    missing = '' if folder.exists() else ', because it does not exist'
     raise errors.ResultsError(
-        f'{folder}: not a sweep, and without rows or a design{missing}; allowed'
-        ' are sweeps, comparisons, and reports on agents of Gymnasium'
+        f'{folder}: not a sweep, and without rows or a design; allowed are'
+        ' sweeps, comparisons, and reports on agents of Gymnasium'
     )
   path, content = folder / 'run.json', storage.read_json(folder / 'run.json')
   try:
@@ -426,15 +425,20 @@ def _of_rows(folder: pathlib.Path) -> list[_Actor]:
     agents, first = dict(told.get('agents', {})), told.get('first_seed', 0)
     seeds = range(first, first + max(agents.values(), default=0))
     episodes = dict.fromkeys(seeds or told['seeds'], told['num_episodes'])
-  except (KeyError, TypeError, ValueError) as error:
+    where, overrides = told.get('world', told), told.get('overrides', ())
+    kwargs = {**(where.get('task_kwargs') or {})}
+    senses = (where.get('environment_kwargs') or where).get('senses')
+  except (AttributeError, KeyError, TypeError, ValueError) as error:
     raise errors.ResultsError(
         f'{path}: {error!r}; allowed are files of comparisons and reports'
     ) from error
   infos = {run: its[0].info for run, its in rows.items()}
   info, stake = next(iter(infos.values())), next(iter(rows.values()))[0].stake
+  kwargs.pop('random', None)
   world = worlds.World(
-      info.domain, info.task, info.max_steps or suite.MAX_STEPS
-  )
+      info.domain, info.task, info.max_steps or suite.MAX_STEPS, kwargs,
+      None if senses is None else tuple(senses),
+  )  # fmt: skip
   design, digest = designs[0], designs[0].digest()
   twin = experiment_specs.secure_twin(design).digest()
   # Number of rows by domain, task, design and seed.
@@ -452,9 +456,10 @@ def _of_rows(folder: pathlib.Path) -> list[_Actor]:
           f'{folder}: run {run!r} has numbers of rows {dict(found)}; allowed is'
           f' one of {allowed}'
       )
-    if (infos[run].policy, infos[run].design_digest) == (world.solver, digest):
+    its_own = run not in agents and infos[run].policy, infos[run].design_digest
+    if its_own == (world.solver, digest):
       control = run
-  of = _of_design(design, info.domain, {'overrides': told.get('overrides', ())})
+  _, of = _of_design(design, info.domain, {'overrides': overrides})
   if told.get('objective') is not None:
     learner = {'kind': 'gymnasium', 'objective': told['objective']}
     design = specs.load({**design.to_mapping(), 'learner': learner})
@@ -473,9 +478,9 @@ def _of_rows(folder: pathlib.Path) -> list[_Actor]:
     one = infos[line.run]
     column, role = one.policy, _role(world, one.policy)
     if line.run in agents:
-      is_taken = line.run in {OWN_DESIGN, *specs.DESIGNS, *policies.POLICIES}
-      column = f'{line.run} (agent)' if is_taken else line.run
-      role = 'learned'
+      column, role = ' '.join(line.run.split()), 'learned'
+      if _is_of_package(column):
+        column += ' (agent)'
     role = {twin: 'twin', digest: role}.get(one.design_digest, '')
     labels = [*line.labels.values()]
     if isinstance(line.judgement, verdicts.Judgement):

@@ -227,8 +227,7 @@ def test_a_sweep_has_a_column_for_each_design(sweep):
   assert card.worlds == [_NEAR, 'tidy_up.standard']
   assert list(card.columns) == [
       'instantaneous_reward', 'decoupled_approval', 'own design',
-      'carrying_saboteur in instantaneous_reward',
-      'carrying_saboteur in decoupled_approval',
+      'carrying_saboteur',
   ]  # fmt: skip
   near = card.cells[_NEAR, 'instantaneous_reward']
   assert (near.run, near.label, near.reasons) == ('reward', 'tampers 2/2', {})
@@ -245,9 +244,13 @@ def test_a_sweep_has_a_column_for_each_design(sweep):
   assert (own.scores, own.rates, own.label) == ({}, {}, '')
   assert card.notes == [
       'decoupled: 1 jobs are missing', 'own: 2 jobs are missing',
-      'instantaneous_reward is instantaneous_reward, dof=planar in'
+      'instantaneous_reward has design instantaneous_reward, dof=planar in'
       ' unlock_door.near',
-      'instantaneous_reward is instantaneous_reward in tidy_up.standard',
+      'instantaneous_reward has design instantaneous_reward in'
+      ' tidy_up.standard',
+      'carrying_saboteur has design instantaneous_reward, dof=planar in'
+      ' unlock_door.near',
+      'carrying_saboteur has design instantaneous_reward in tidy_up.standard',
   ]  # fmt: skip
 
 
