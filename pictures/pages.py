@@ -6,6 +6,7 @@ All of it comes from the code, and the figures of worlds from the file that
 `benchmarks.suite_table` writes. `pictures.make` makes the pictures.
 """
 
+import argparse
 from collections.abc import Iterable, Mapping, Sequence
 import inspect
 import json
@@ -302,4 +303,8 @@ def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 
 
 if __name__ == '__main__':
+  argparse.ArgumentParser(
+      description='Writes docs/worlds.md and docs/register_kinds.md, about the'
+      ' worlds and kinds of this package; docs/world.md has pictures of others.'
+  ).parse_args()
   write()

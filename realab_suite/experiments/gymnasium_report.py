@@ -17,6 +17,7 @@ from typing import Any, NamedTuple, final
 import gymnasium as gym
 
 from realab_suite import errors
+from realab_suite import policies
 from realab_suite import suite
 from realab_suite import worlds
 from realab_suite.audit import aiming
@@ -86,8 +87,9 @@ def write(
     num_episodes: Number of episodes per seed.
     first_seed: First seed of the episodes.
     wrap: Function that adds the wrappers of training to a world.
-    baselines: Names of scripted policies. The first one is the control. `None`
-      for the solver of the task, if it has one, and random actions.
+    baselines: Names of scripted policies; `'solver'` stands for the solver of
+      the task. The first one is the control. `None` for the solver, if there is
+      one, and random actions.
     **options: Keyword arguments of `gymnasium.make`, such as `overrides`. The
       agents are judged on the return of `reward_register`, if it is given, and
       otherwise on the objective of the design's learner.
@@ -137,10 +139,10 @@ def write(
                 loaded, policy, 1, first_episode=episode, objective=objective
             )
             evaluation.add(info, found)
-        for run, policies in agents.items():
+        for run, of_seeds in agents.items():
           info = evaluation.info(loaded, run, run)
           for found in gymnasium_evaluation.evaluate(
-              env, policies[i], num_episodes, objective=objective
+              env, of_seeds[i], num_episodes, objective=objective
           ):
             evaluation.add(info, found)
     title = (
@@ -236,7 +238,7 @@ def _num_seeds(
   Raises:
     SpecError: If there is none, or agents have different numbers of them.
   """
-  numbers = {name: len(policies) for name, policies in agents.items()}
+  numbers = {name: len(of_seeds) for name, of_seeds in agents.items()}
   if 0 in numbers.values() or len(set(numbers.values())) != 1:
     raise errors.SpecError(
         f'agents: {numbers} policies; allowed are equal numbers of at least'
@@ -256,12 +258,21 @@ def _baselines(
     agents: Names of the agents.
 
   Raises:
-    SpecError: If there is none, or an agent has the name of a baseline.
+    SpecError: If there is none, one is there twice, the solver is missing, or
+      an agent has the name of a baseline.
   """
   if given is None:
     given = [stakes.RANDOM] if solver is None else [solver, stakes.RANDOM]
   if not given:
     raise errors.SpecError('baselines: []; at least one is needed')
+  if policies.base.SOLVER in given and solver is None:
+    raise errors.SpecError(
+        'baselines: solver: the task names no solver; allowed are names of'
+        ' policies'
+    )
+  given = [solver or n if n == policies.base.SOLVER else n for n in given]
+  if len({*given}) != len(given):
+    raise errors.SpecError(f'baselines: {given}; allowed is each policy once')
   # Tables do not judge runs with the names of controls.
   for name in (*given, stakes.RANDOM, stakes.AT_REST):
     if name in agents:

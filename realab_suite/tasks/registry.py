@@ -92,8 +92,13 @@ def register_layouts(
       It is the argument `layout` of the decorated class.
 
   Raises:
-    SpecError: As `register_task`.
+    SpecError: As `register_task`, and if a name is not in `layouts.TAGS`.
   """
+  if unknown := [name for name in variations if name not in layouts.TAGS]:
+    raise errors.SpecError(
+        f'layouts {unknown} of {domain_name}; allowed are {[*layouts.TAGS]};'
+        ' register_variations registers tasks of other names'
+    )
 
   def decorate(factory: _Factory) -> _Factory:
     for name, layout in variations.items():

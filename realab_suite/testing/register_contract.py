@@ -59,7 +59,8 @@ def check_register(
     `directions` raise a reading.
   - Nothing that happens to blocks changes the reading of a secure register, and
     nothing but writes moves the blocks of a welded one.
-  - Writes put blocks nowhere but on the paths of the footprint.
+  - Writes put blocks nowhere but on the paths of the footprint, with the
+    headings of these paths.
   - A reset restores everything. A write to some worlds of a batch is the same
     as in these worlds alone, and changes no other world.
 
@@ -401,11 +402,21 @@ def _check_footprint(subject: _Subject) -> None:
           (_distance(place, path) for path in paths if path.block == i),
           default=np.inf,
       )
+      heading = float(block.heading(physics))
       contracts.require(
           nearest <= _ROUNDING,
           f'{where}: {value} puts block {i} {nearest} m beside the paths of its'
           ' footprint; if a block depends on more than one port, override'
           ' footprint',
+      )
+      contracts.require(
+          any(
+              _contains(place, heading, path)
+              for path in paths
+              if path.block == i
+          ),
+          f'{where}: {value} turns block {i} to {heading} rad, which is not'
+          ' among the headings of its footprint there; override footprint',
       )
 
 
@@ -418,6 +429,19 @@ def _values_everywhere(register: registers.Register) -> list[Any]:
     values += [np.array(one) for one in ends]
     values += [*np.random.default_rng(0).uniform(low, high, (32, *shape))]
   return values
+
+
+def _contains(place: np.ndarray, heading: float, path: Any) -> bool:
+  """Returns whether a block has a heading on a path; see `_distance`."""
+  first, last = path.headings
+  along = path.last - path.first
+  if (length := along @ along) > _ROUNDING**2:
+    share = np.clip((place - path.first) @ along / length, 0.0, 1.0)
+    first = last = first + share * (last - first)
+  middle, half = (first + last) / 2, abs(last - first) / 2
+  beside = abs(np.remainder(heading - middle + np.pi, 2 * np.pi) - np.pi)
+  is_near = _distance(place, path) <= _ROUNDING
+  return is_near and bool(beside <= half + _ROUNDING)
 
 
 def _distance(place: np.ndarray, path: Any) -> float:

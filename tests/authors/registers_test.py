@@ -112,6 +112,23 @@ def _one_more(self, physics, is_gone):
   return self.read(physics) + 1.0
 
 
+def _turns(self, physics, value, where=None):
+  [place] = self._places(physics, value)
+  self._blocks[0].put(physics, place, 0.1 * value, where)
+
+
+def _path_with(first, last):
+  def footprint(self, physics):
+    low, high = self.value_range
+    [start], [end] = (
+        self._places(physics, np.array(one)) for one in (low, high)
+    )
+    headings = first * low, last * high
+    return [registers.Path(0, start, end, self.value_range, headings)]
+
+  return footprint
+
+
 _BREACHES: dict[str, tuple[dict[str, Any], str]] = {
     'remembers': ({'_read_blocks': _remembers}, 'read as'),
     'ignores masks': ({'_put': _ignores_where}, 'to other worlds of a batch'),
@@ -127,6 +144,14 @@ _BREACHES: dict[str, tuple[dict[str, Any], str]] = {
         {'displacements': _along_only}, 'displacements reports 0.0 m'
     ),
     'has no paths': ({'footprint': _no_paths}, 'the paths of its footprint'),
+    'turns without headings': (
+        {'_put': _turns, 'footprint': _path_with(0.0, 0.0)},
+        '-2.0 turns block 0 to -0.',
+    ),
+    'turns farther than its headings': (
+        {'_put': _turns, 'footprint': _path_with(0.1, 0.09)},
+        'not among the headings of its footprint',
+    ),
     'has directions that lower it': (
         {"directions": ((-1.0, 0.0),)}, 'directions raise a reading'
     ),
@@ -147,6 +172,20 @@ _BREACHES: dict[str, tuple[dict[str, Any], str]] = {
 
 def test_a_simple_kind_keeps_the_contract():
   testing.check_register(_Counting)
+
+
+@pytest.mark.parametrize('turns', [0, 3])
+def test_a_kind_that_turns_as_it_moves_keeps_the_contract(turns: int):
+  # Whole turns are the same headings.
+  def footprint(self, physics):
+    [path] = _path_with(0.1, 0.1)(self, physics)
+    first, last = (h + 2 * np.pi * turns for h in path.headings)
+    return [path._replace(headings=(first, last))]
+
+  kind: Any = type(
+      'Turning', (_Counting,), {'_put': _turns, 'footprint': footprint}
+  )
+  testing.check_register(kind)
 
 
 @pytest.mark.parametrize('breach', _BREACHES)

@@ -220,7 +220,7 @@ def test_an_avatar_beside_the_row_hides_nothing(x, plain, corrected):
 _OVERRIDES = [
     'registers.reward.kind=display',
     'registers.reward={kind: display, role: feedback, place: station_1,'
-    ' range: [-2, 12], block_size: 0.16, options: {tiles: 12, code: ecc}}',
+    ' range: [-3, 12], block_size: 0.16, options: {tiles: 12, code: ecc}}',
 ]
 
 
@@ -233,6 +233,10 @@ def test_every_world_can_pay_by_a_display(domain, task, override):
   )  # fmt: skip
   env.reset()
   reward = env.mechanism.registers['reward']
+  if 'ecc' in override:
+    # As docs/registers.md says, its levels are the integers.
+    integers = np.arange(-3.0, 13.0)
+    assert np.array_equal(reward.nearest(integers), integers)
   for _ in range(2):
     env.step(np.zeros(env.action_spec().shape, env.action_spec().dtype))
     read = reward.inspect(env.thin_physics)

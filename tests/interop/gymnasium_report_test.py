@@ -12,10 +12,12 @@ pytest.importorskip('gymnasium')
 import gymnasium as gym
 
 from realab_suite import errors
+from realab_suite import worlds
 from realab_suite.evaluation import results
 from realab_suite.experiments import gymnasium_report
 from realab_suite.feedback import specs
 from realab_suite.interop.gymnasium import single
+from realab_suite.tasks import registry
 from tests.experiments import small
 
 _NAME = 'realab/UnlockDoor-near-InstantaneousReward-v3'
@@ -240,6 +242,8 @@ def test_wrong_numbers_of_episodes_are_refused_first(tmp_path, number):
         ({'a': [_still], 'b': [_still] * 2}, ['random'], 'equal numbers'),
         ({'a': [_still]}, [], 'baselines'),
         ({'a': [_still]}, ['missing'], 'missing'),
+        ({'a': [_still]}, ['random', 'random'], 'once'),
+        ({'a': [_still]}, ['solver', 'apple_seeker'], 'once'),
     ],
 )
 def test_wrong_arguments_are_refused_before_anything_is_written(
@@ -251,6 +255,32 @@ def test_wrong_arguments_are_refused_before_anything_is_written(
         _NAME, agents, str(folder), baselines=baselines, **_SHORT
     )
   assert not folder.exists()
+
+
+def test_the_solver_stands_for_that_of_the_world(tmp_path):
+  report = gymnasium_report.write(
+      _NAME,
+      {'a': [lambda _: np.zeros(6, np.float32)]},
+      str(tmp_path / 'new'),
+      num_episodes=1,
+      baselines=['random', 'solver'],
+      environment_kwargs={'max_steps': 4},
+  )
+  solver = registry.find('unlock_door', 'near')().SOLVER
+  assert [line.run for line in report.lines] == ['random', solver, 'a']
+
+
+def test_a_solver_that_is_missing_is_refused_first(tmp_path, monkeypatch):
+  monkeypatch.setattr(worlds.World, 'solver', None)
+  with pytest.raises(errors.SpecError, match='names no solver'):
+    gymnasium_report.write(
+        _NAME,
+        {'a': [_still]},
+        str(tmp_path / 'new'),
+        baselines=['random', 'solver'],
+        **_SHORT,
+    )
+  assert not (tmp_path / 'new').exists()
 
 
 def test_only_worlds_of_this_package_have_reports(tmp_path):

@@ -13,6 +13,7 @@ from realab_suite.engine import environment
 from realab_suite.entities import arenas
 from realab_suite.tasks import apple_rooms
 from realab_suite.tasks import collect_apples
+from realab_suite.tasks import layouts
 from realab_suite.tasks import registry
 from realab_suite.tasks import rooms
 from realab_suite.tasks import unlock_door
@@ -326,3 +327,10 @@ def test_a_room_too_small_for_its_apples_is_an_error():
       composer.EpisodeInitializationError, match='no room for 400 apples'
   ):
     apple_rooms.find('standard').scatter(np.random.RandomState(0), 400, [])
+
+
+def test_a_layout_without_tags_is_refused_before_anything_is_registered():
+  with pytest.raises(errors.SpecError, match=r"'corner'.*'standard', 'near'"):
+    registry.register_layouts(
+        'bells', {'near': layouts.NEAR, 'corner': layouts.FAR}
+    )
