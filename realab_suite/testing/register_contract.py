@@ -434,10 +434,6 @@ def _values_everywhere(register: registers.Register) -> list[Any]:
 def _contains(place: np.ndarray, heading: float, path: Any) -> bool:
   """Returns whether a block has a heading on a path; see `_distance`."""
   first, last = path.headings
-  along = path.last - path.first
-  if (length := along @ along) > _ROUNDING**2:
-    share = np.clip((place - path.first) @ along / length, 0.0, 1.0)
-    first = last = first + share * (last - first)
   middle, half = (first + last) / 2, abs(last - first) / 2
   beside = abs(np.remainder(heading - middle + np.pi, 2 * np.pi) - np.pi)
   is_near = _distance(place, path) <= _ROUNDING

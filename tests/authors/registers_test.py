@@ -188,6 +188,21 @@ def test_a_kind_that_turns_as_it_moves_keeps_the_contract(turns: int):
   testing.check_register(kind)
 
 
+def test_a_kind_may_turn_back_and_forth_along_its_path():
+  # One path, with all headings, from one end to the other.
+  def turns(self, physics, value, where=None):
+    [place] = self._places(physics, value)
+    heading = 0.4 * np.sin(9.0 * value)
+    self._blocks[0].put(physics, place, heading, where)
+
+  def footprint(self, physics):
+    [path] = _path_with(0.0, 0.0)(self, physics)
+    return [path._replace(headings=(-0.4, 0.4))]
+
+  members = {'_put': turns, 'footprint': footprint}
+  testing.check_register(type('Swinging', (_Counting,), members))
+
+
 @pytest.mark.parametrize('breach', _BREACHES)
 def test_a_breach_of_the_contract_is_named(breach: str):
   members, message = _BREACHES[breach]
