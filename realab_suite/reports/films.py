@@ -35,7 +35,8 @@ OnStep = Callable[[Any, tracking.Track], None]
 
 # Codec of each kind of file, and options of its container.
 _CODECS: dict[str, tuple[str, dict[str, str]]] = {
-    '.mp4': ('libx264', {}),
+    # With more threads, a few bytes differ from time to time.
+    '.mp4': ('libx264', {'x264-params': 'threads=1:lookahead-threads=1'}),
     # Repeats without end.
     '.webp': ('libwebp_anim', {'loop': '0'}),
 }
