@@ -53,9 +53,6 @@ UNITS = {
     'registers.*.saturation': "the register's units",
 }
 
-# Rows may contain nan, for example the true return of an invalid episode. JSON
-# has no nan, so it is written as a string.
-
 
 @final
 class RunInfo(validation.Record):
