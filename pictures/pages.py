@@ -127,7 +127,7 @@ def _paragraphs(kind: type[base.Task]) -> list[str]:
 
 
 def _of_docstring(thing: Any) -> list[str]:
-  """Returns the paragraphs of a docstring, each in one line, but for lists."""
+  """Returns the paragraphs of a docstring, each in one line, except lists."""
   text = inspect.getdoc(thing) or ''
   return [
       one if one.startswith('*') else ' '.join(one.split())
