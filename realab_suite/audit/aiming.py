@@ -5,6 +5,7 @@ their reading, so that registers of any kind can be attacked.
 """
 
 from collections.abc import Sequence
+import contextlib
 import inspect
 from typing import Any, NamedTuple, final
 
@@ -12,6 +13,7 @@ import numpy as np
 
 from realab_suite import errors
 from realab_suite import policies
+from realab_suite import worlds
 from realab_suite.engine import environment
 from realab_suite.entities import appearance
 from realab_suite.entities import avatars
@@ -175,9 +177,69 @@ def make_policy(
   Raises:
     SpecError: If the policy or the register does not exist.
   """
-  takes = inspect.signature(policies.POLICIES.get(name)).parameters
-  if not {'target', 'direction'} & set(takes):
+  if not (takes := _aims(name)):
     return policies.make(name)
+  env.rewind(episode)
+  env.reset()
+  block = _first_target(name, env, target)
+  x, y = positions(env.physics, [block.block_in(env)])[0]
+  angle = block.angles[0]
+  options = {
+      'target': (float(x), float(y)),
+      'direction': (float(np.cos(angle)), float(np.sin(angle))),
+      'code': block.code,
+  }
+  return policies.make(
+      name, **{key: value for key, value in options.items() if key in takes}
+  )
+
+
+def make_batch_policy(
+    name: str,
+    world: worlds.World,
+    design: specs.DesignSpec,
+    seed: int,
+    num_envs: int,
+) -> policies.Policy:
+  """Returns a policy for the first episode of each world of a batch.
+
+  Saboteurs get the block that they move, and where it is in each world. Other
+  policies with a `target` get the one of the first world.
+
+  Args:
+    name: Name of the policy in `policies.POLICIES`.
+    world: The world.
+    design: Design of the agent.
+    seed: Seed of the batch.
+    num_envs: Number of worlds.
+
+  Raises:
+    SpecError: If the policy does not exist, or the design has no register.
+  """
+  if not _aims(name):
+    return policies.make(name)
+  with contextlib.closing(world.load(design, seed)) as env:
+    policy = make_policy(name, env, None, 0)
+    block = _first_target(name, env, None)
+  if isinstance(policy, saboteurs.Saboteur):
+    batch = world.load_batch(design, num_envs, seed)
+    with contextlib.closing(batch):
+      batch.reset()
+      places = positions(batch.physics, [block.block_in(batch)])
+      policy = policy.starting_at(places[:, 0])
+  return policy
+
+
+def _aims(name: str) -> set[str]:
+  """Returns the options of a policy that aim it; none if it has no target."""
+  takes = {*inspect.signature(policies.POLICIES.get(name)).parameters}
+  return takes if {'target', 'direction'} & takes else set()
+
+
+def _first_target(
+    name: str, env: environment.Environment, target: str | None
+) -> Target:
+  """Returns the block that a policy moves; see `make_policy`."""
   mechanism = env.mechanism
   if target is None:
     movable = attacked(mechanism.design)
@@ -191,16 +253,4 @@ def make_policy(
         f' {mechanism.design.name!r} has no {target or "feedback register"!r};'
         f' it has {sorted(mechanism.registers)}'
     )
-  env.rewind(episode)
-  env.reset()
-  block = targets(env, [target])[0]
-  x, y = positions(env.physics, [block.block_in(env)])[0]
-  angle = block.angles[0]
-  options = {
-      'target': (float(x), float(y)),
-      'direction': (float(np.cos(angle)), float(np.sin(angle))),
-      'code': block.code,
-  }
-  return policies.make(
-      name, **{key: value for key, value in options.items() if key in takes}
-  )
+  return targets(env, [target])[0]

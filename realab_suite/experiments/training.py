@@ -207,8 +207,9 @@ def _evaluate(
   ) as batch:
     actor: batch_actors.BatchActor
     if learner is None:
-      with contextlib.closing(world.load(job.design, seed)) as env:
-        policy = aiming.make_policy(job.kind, env, None, 0)
+      policy = aiming.make_batch_policy(
+          job.kind, world, job.design, seed, evaluation.episodes
+      )
       actor = batch_actors.BatchPolicyActor(policy, batch, seed)
     else:
       actor = _LearnerActor(learner, seed, evaluation.actions == 'greedy')

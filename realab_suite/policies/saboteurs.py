@@ -1,7 +1,8 @@
 """Scripted policies that tamper: they move a block of a register."""
 
 import abc
-from typing import Annotated, Any, Final, Literal, NamedTuple, final
+import copy
+from typing import Annotated, Any, Final, Literal, NamedTuple, Self, final
 
 import numpy as np
 import pydantic
@@ -110,6 +111,16 @@ class Saboteur(base.Policy, abc.ABC):
         code=np.array(self._code),
     )
 
+  def starting_at(self, places: np.ndarray) -> Self:
+    """Returns the policy for worlds in which the block starts elsewhere.
+
+    Args:
+      places: Initial positions of the block, `(worlds, 2)`, metres.
+    """
+    moved = copy.copy(self)
+    moved._aim = self._aim._replace(start=np.array(places, float))
+    return moved
+
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
     return {
         'code': np.full(batch_shape, self._code),
@@ -133,7 +144,7 @@ class Saboteur(base.Policy, abc.ABC):
   ) -> tuple[np.ndarray, Any]:
     del key
     start = np.asarray(episode_start)
-    memory = navigation.restarted(start, self.initial_state(()), state)
+    memory = navigation.restarted(start, self.initial_state(start.shape), state)
     view = navigation.view(observation)
     holds = np.asarray(observation['senses/holding'])[..., 0] > 0
     code = memory['code']

@@ -41,12 +41,21 @@ def test_all_evaluation_episodes_are_attributed(tmp_path):
 
 
 _ALONE = 'registers.reward.kind=block_position'
+# A place of its own in each world of the batch, and one aim for all.
+_ELSEWHERE = (
+    'registers.reward.place={position: [0.9, -2.4], spread: [0.5, 0.3]}'
+)
 _TURNED = 'registers.reward.place={position: [1.5, -2.0], yaw: 1.5708}'
 
 
 @pytest.mark.parametrize(
     'overrides',
-    [(_TURNED,), (_ALONE, _TURNED), ('registers.reward.channel=secure',)],
+    [
+        (_TURNED,),
+        (_ALONE, _TURNED),
+        (_ELSEWHERE,),
+        ('registers.reward.channel=secure',),
+    ],
 )
 def test_a_saboteur_moves_what_can_be_moved_the_way_that_pays(
     tmp_path, overrides

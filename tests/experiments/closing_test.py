@@ -229,8 +229,7 @@ def test_a_scripted_job_that_fails_closes_its_worlds(
   _fail_at(monkeypatch, _BATCH, 'step', 5, Failed)
   with pytest.raises(Failed):
     _run(_job('reward.random'), tmp_path)
-  # The second one is for aiming.
-  assert made.num_made == 2
+  assert made.num_made == 1
   assert not made.open
 
 
