@@ -65,7 +65,7 @@ _MAY_IMPORT = {
         'entities.appearance',
         'feedback.objectives',
         'feedback.specs',
-        'policies.action_sets',
+        'policies',
     ),
     'suite': _BELOW_SUITE,
     'worlds': _WITH_SUITE,

@@ -25,6 +25,8 @@ class Controls:
     queries: Names of the query registers that an action writes. Their values
       are the first elements of the action.
     num_actions: Number of discrete actions; `None` if actions are vectors.
+    action_set: The set of these actions; `None` if actions are vectors, or not
+      those of a set.
     low: Lower bound of every element, including queries.
     high: Upper bound of every element, including queries.
   """
@@ -33,6 +35,7 @@ class Controls:
   dtype: np.dtype
   queries: tuple[str, ...]
   num_actions: int | None
+  action_set: action_sets.ActionSet | None
   low: np.ndarray
   high: np.ndarray
 
@@ -46,7 +49,8 @@ class Controls:
     """
     if isinstance(spec, specs.DiscreteArray):
       bounds = np.zeros(()), np.array(spec.num_values - 1.0)
-      return cls((), spec.dtype, (), spec.num_values, *bounds)
+      known = _action_set(spec.name or '')
+      return cls((), spec.dtype, (), spec.num_values, known, *bounds)
     if spec.shape[1:] or not spec.shape or spec.dtype.kind not in 'if':
       raise errors.SpecError(
           f'action_spec: {spec!r:.120}; allowed are a DiscreteArray and a'
@@ -60,10 +64,11 @@ class Controls:
     if isinstance(spec, specs.BoundedArray):
       low = np.array(np.broadcast_to(spec.minimum, spec.shape), float)
       high = np.array(np.broadcast_to(spec.maximum, spec.shape), float)
-    num_actions = None
+    known = None
     if len(queries) + 1 == spec.shape[0]:
-      num_actions = _num_actions(names[-1])
-    return cls(spec.shape, spec.dtype, queries, num_actions, low, high)
+      known = _action_set(names[-1])
+    num_actions = None if known is None else len(known)
+    return cls(spec.shape, spec.dtype, queries, num_actions, known, low, high)
 
   @property
   def size(self) -> int:
@@ -140,13 +145,11 @@ class Controls:
     return action.clip(self.low, self.high).astype(self.dtype)
 
 
-def _num_actions(name: str) -> int | None:
-  """Returns the size of the action set of an element, or `None` without one.
+def _action_set(name: str) -> action_sets.ActionSet | None:
+  """Returns the action set of an element, or `None` without one.
 
   Args:
     name: Name of the element in the action spec, such as 'dmlab_like/v1'.
   """
   match = re.fullmatch(r'(\w+)/v(\d+)', name)
-  if match is None:
-    return None
-  return len(action_sets.get(match[1], int(match[2])))
+  return None if match is None else action_sets.get(match[1], int(match[2]))

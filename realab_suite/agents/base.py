@@ -25,6 +25,7 @@ Fraction = Annotated[float, pydantic.Field(ge=0, le=1)]
 Rate = Annotated[float, pydantic.Field(gt=0, le=1)]
 Weight = Annotated[float, pydantic.Field(ge=0, le=1000)]
 Choice = dict[str, np.ndarray]
+FIRST = int(dm_env.StepType.FIRST)
 
 # Each stream has a key of its own, so that the draws of one reveal nothing
 # about the others.
@@ -154,10 +155,12 @@ class Learner(abc.ABC):
           'discount': np.array(time_step.discount, np.float32),
           # The step that begins an episode ignores the action, so it is not an
           # outcome of the last choice.
-          'is_valid': step_type != int(dm_env.StepType.FIRST),
+          'is_valid': step_type != FIRST,
+          **self._also_read(time_step),
       }
       self._observe(transition, observation)
     choice = self._choose(observation, self._act_keys(), greedy=False)
+    choice = self._steered(choice, time_step)
     self._last = {'observation': observation, 'choice': choice}
     self._num_acts += 1
     return self._encode(choice)
@@ -174,7 +177,7 @@ class Learner(abc.ABC):
       time_step: Time step of any number of worlds.
       earlier: Result for the step before, or `None` for the first one.
     """
-    is_first = np.asarray(time_step.step_type) == int(dm_env.StepType.FIRST)
+    is_first = np.asarray(time_step.step_type) == FIRST
     return self._encoder.stack(time_step.observation, is_first, earlier)
 
   @jax_settings.pinned()
@@ -247,7 +250,7 @@ class Learner(abc.ABC):
         'keys': {name: key.copy() for name, key in self._keys.items()},
         'last': copy.deepcopy(self._last),
         'metrics': dict(self._metrics),
-        'trained': _to_plain(self._networks),
+        'trained': to_plain(self._networks),
         'memory': copy.deepcopy(self._memory()),
     }
 
@@ -264,7 +267,7 @@ class Learner(abc.ABC):
           f'state of a learner: kind {state.get("kind")!r}; this learner is'
           f' {self._options.kind!r}'
       )
-    self._networks = _from_plain(self._networks, state['trained'])
+    self._networks = from_plain(self._networks, state['trained'])
     self._set_memory(copy.deepcopy(state['memory']))
     self._num_acts = int(state['num_acts'])
     self._num_updates = int(state['num_updates'])
@@ -275,7 +278,7 @@ class Learner(abc.ABC):
   def _act_keys(self) -> dict[str, np.ndarray]:
     """Returns the random keys of this step's choice, by stream."""
     return {
-        name: _folded(self._keys[name], self._num_acts)
+        name: folded(self._keys[name], self._num_acts)
         for name in ('act', 'query')
     }
 
@@ -286,10 +289,20 @@ class Learner(abc.ABC):
 
   def _update_key(self) -> np.ndarray:
     """Returns the random key of the next update."""
-    return _folded(self._keys['update'], self._num_updates)
+    return folded(self._keys['update'], self._num_updates)
 
   def _encode(self, choice: Choice) -> np.ndarray:
     return self._controls.encode(choice['action'], self._queries(choice))
+
+  def _steered(self, choice: Choice, time_step: TimeStep) -> Choice:
+    """Returns the choice to act on, which may not be the learner's own."""
+    del time_step
+    return choice
+
+  def _also_read(self, time_step: TimeStep) -> dict[str, Any]:
+    """Returns further entries of the transition that ends with a time step."""
+    del time_step
+    return {}
 
   def _queries(self, choice: Choice) -> dict[str, np.ndarray]:
     """Returns the values of query registers by name, each `(worlds,)`."""
@@ -394,14 +407,14 @@ def _find_reading(
 ) -> str:
   """Returns the observation key of the reading that a learner learns from."""
   register = getattr(options, field)
-  for key in (f'registers/{register}', register):
-    if key in observation_spec:
-      if observation_spec[key].shape:
-        raise errors.SpecError(
-            f'learner.{field}: {key!r} has shape {observation_spec[key].shape};'
-            ' allowed are scalars'
-        )
-      return key
+  key = features.key_of(register, observation_spec)
+  if key is not None:
+    if observation_spec[key].shape:
+      raise errors.SpecError(
+          f'learner.{field}: {key!r} has shape {observation_spec[key].shape};'
+          ' allowed are scalars'
+      )
+    return key
   raise errors.SpecError(
       f'learner.{field}: the agent does not read {register!r}; this environment'
       f' has {sorted(observation_spec)}'
@@ -412,19 +425,19 @@ def _num_envs(observation: Mapping[str, np.ndarray]) -> int:
   return len(next(iter(observation.values())))
 
 
-def _folded(key: np.ndarray, number: int) -> np.ndarray:
+def folded(key: np.ndarray, number: int) -> np.ndarray:
   """Returns the random key for a numbered step of a stream, `(2,)`."""
   words = [*(int(word) for word in key), number]
   return np.random.SeedSequence(words).generate_state(2)
 
 
-def _to_plain(tree: Any) -> dict[str, np.ndarray]:
+def to_plain(tree: Any) -> dict[str, np.ndarray]:
   """Returns the arrays of a pytree by their key path."""
   leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
   return {jax.tree_util.keystr(path): np.array(leaf) for path, leaf in leaves}
 
 
-def _from_plain(like: Any, arrays: Mapping[str, Any]) -> Any:
+def from_plain(like: Any, arrays: Mapping[str, Any]) -> Any:
   """Returns a pytree with the structure of `like` and the given arrays.
 
   Args:

@@ -1,6 +1,6 @@
 """Encoding of observations as features of networks, from specs alone."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 import dataclasses
 from typing import Any, Literal, final
 
@@ -107,6 +107,12 @@ class Encoder:
     return {e.name: e.shape for e in self.entries if e.kind == 'image'}
 
   @property
+  def names(self) -> tuple[str, ...]:
+    """Keys of observations that are encoded."""
+    partners = (e.partner for e in self.entries if e.partner)
+    return (*(e.name for e in self.entries), *partners)
+
+  @property
   def vector_size(self) -> int:
     """Number of features, excluding images."""
     return sum(
@@ -181,6 +187,17 @@ class Encoder:
       part = _features(entry, value, packed)
       parts.append(part.reshape(*lead, -1).astype(jnp.float32))
     return {'vector': jnp.concatenate(parts, axis=-1), **encoded}
+
+
+def key_of(register: str, observation: Collection[str]) -> str | None:
+  """Returns the key of the reading of a register; `None` if there is none.
+
+  Args:
+    register: Name of the register.
+    observation: Keys of observations.
+  """
+  keys = (f'registers/{register}', register)
+  return next((key for key in keys if key in observation), None)
 
 
 def _features(

@@ -126,6 +126,7 @@ class Network(eqx.Module):
       size_out: int,
       scale_out: float,
       generator: np.random.Generator,
+      num_more: int = 0,
   ) -> None:
     """Makes a network for the features of an encoder.
 
@@ -135,8 +136,9 @@ class Network(eqx.Module):
       size_out: Number of outputs.
       scale_out: Scale of the last layer's initial weights.
       generator: Random generator of the initial weights.
+      num_more: Number of elements of `vector` after those of the encoder.
     """
-    size = encoder.vector_size
+    size = encoder.vector_size + num_more
     self.convolutions = {}
     for name, shape in sorted(encoder.image_shapes.items()):
       self.convolutions[name] = Convolutions(shape[-1], generator)

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 import functools
-from typing import Any, Literal, final
+from typing import Annotated, Any, Literal, final
 
 import equinox as eqx
 import jax
@@ -10,10 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from realab_suite.agents import base
+from realab_suite.agents import defences
 from realab_suite.agents import features
+from realab_suite.agents import guards
+from realab_suite.agents import jax_settings
 from realab_suite.agents import networks
 from realab_suite.agents import on_policy
 from realab_suite.agents import training
+from realab_suite.config import option_types
 from realab_suite.feedback import objectives
 
 
@@ -27,6 +31,7 @@ class PolicyGradientOptions(on_policy.OnPolicyOptions):
     gae_lambda: Decay of generalised advantage estimates.
     entropy: Weight of the policy's entropy in the loss.
     clip: Largest change of a probability ratio in one update.
+    defence: What the learner does about corrupted rewards; `None` for nothing.
   """
 
   kind: Literal['policy_gradient']
@@ -35,6 +40,10 @@ class PolicyGradientOptions(on_policy.OnPolicyOptions):
   gae_lambda: base.Fraction = 0.95
   entropy: base.Weight = 0.01
   clip: base.Fraction = 0.2
+  defence: (
+      Annotated[defences.Defence, option_types.ModelIn(defences.DEFENCES)]
+      | None
+  ) = None
 
 
 @final
@@ -53,8 +62,19 @@ class PolicyGradient(on_policy.OnPolicyLearner):
   OPTIONS = PolicyGradientOptions
   READS = 'reward'
 
-  def __init__(self, *args: Any, **kwargs: Any) -> None:
-    super().__init__(*args, **kwargs)
+  @jax_settings.pinned()
+  def __init__(self, options: Any, *args: Any, **kwargs: Any) -> None:
+    # Compiled functions depend on the other options alone.
+    plain = options.model_copy(update={'defence': None})
+    super().__init__(plain, *args, **kwargs)
+    self._guard: guards.Guard | None = None
+    if options.defence is not None:
+      setting = defences.Setting(
+          plain, self._encoder, self._controls, self._num_envs
+      )
+      key = base.folded(self._keys['initial'], 1).astype(np.uint64)
+      generator = np.random.Generator(np.random.Philox(key=key))
+      self._guard = guards.Guard(options.defence, setting, generator)
     self._scale = training.FeedbackScale(self._num_envs, self._options.gamma)
 
   def _initial_networks(self, generator: np.random.Generator) -> Any:
@@ -83,6 +103,19 @@ class PolicyGradient(on_policy.OnPolicyLearner):
     )
     return {'action': np.asarray(action), 'log_prob': np.asarray(log_prob)}
 
+  def _steered(
+      self, choice: base.Choice, time_step: base.TimeStep
+  ) -> base.Choice:
+    if self._guard is None:
+      return choice
+    return self._guard.steer(choice, time_step, self._act_keys()['query'])
+
+  def _also_read(self, time_step: base.TimeStep) -> dict[str, Any]:
+    return {} if self._guard is None else self._guard.read(time_step)
+
+  def _queries(self, choice: base.Choice) -> dict[str, np.ndarray]:
+    return {} if self._guard is None else self._guard.queries(choice)
+
   def _probabilities(self, observation: features.Packed) -> Any:
     return networks.probabilities(
         self._encoder, self._networks[0].policy, observation
@@ -91,9 +124,13 @@ class PolicyGradient(on_policy.OnPolicyLearner):
   def _learn(
       self, batch: dict[str, Any], observation: features.Packed
   ) -> dict[str, Any]:
+    metrics = {}
+    if self._guard is not None:
+      batch = self._guard.treat(batch, base.folded(self._update_key(), 1))
+      metrics = dict(self._guard.metrics)
     self._scale.update(batch)
     reading = batch['reading'] / np.float32(self._scale.value)
-    self._networks, metrics = _update(
+    self._networks, updated = _update(
         self._options,
         self._encoder,
         self._networks,
@@ -101,12 +138,15 @@ class PolicyGradient(on_policy.OnPolicyLearner):
         observation,
         self._draw_minibatches(),
     )
-    return {**metrics, 'feedback_scale': self._scale.value}
+    return {**metrics, **updated, 'feedback_scale': self._scale.value}
 
   def _memory(self) -> dict[str, Any]:
-    return {**super()._memory(), 'scale': self._scale.state()}
+    guard = {} if self._guard is None else {'guard': self._guard.state()}
+    return {**super()._memory(), 'scale': self._scale.state(), **guard}
 
   def _set_memory(self, memory: dict[str, Any]) -> None:
+    if self._guard is not None:
+      self._guard.set_state(memory['guard'])
     super()._set_memory(memory)
     self._scale.set_state(memory['scale'])
 

@@ -89,11 +89,19 @@ A `KeyError` means that an option is missing.
 @OBJECTIVES.add('policy_gradient')
 @OBJECTIVES.add('q_learning')
 def _return(options: _Options) -> dict[str, Any]:
-  return {
+  registers = {_name(options, 'reward'): 1.0}
+  objective = {
       'kind': RETURN,
-      'registers': {_name(options, 'reward'): 1.0},
+      'registers': registers,
       'discount': options.get('gamma', DEFAULT_DISCOUNT),
   }
+  defence = options.get('defence')
+  if isinstance(defence, Mapping) and defence.get('kind') == 'mona':
+    # Approval is paid beside the reward.
+    if weight := defence.get('weight', 1.0):
+      registers[_name(defence, 'approval')] = weight
+    objective['queries'] = [_name(defence, 'query')]
+  return objective
 
 
 @OBJECTIVES.add('value_advice')

@@ -1,0 +1,11 @@
+"""Defences of learners against corrupted rewards; see `base`."""
+
+from realab_suite.agents.defences.alarm import Alarm
+from realab_suite.agents.defences.base import DEFENCES
+from realab_suite.agents.defences.base import Batch
+from realab_suite.agents.defences.base import Defence
+from realab_suite.agents.defences.base import Setting
+from realab_suite.agents.defences.base import Treated
+from realab_suite.agents.defences.cap import Cap
+from realab_suite.agents.defences.mona import Mona
+from realab_suite.agents.defences.orpo import Orpo

@@ -1,0 +1,50 @@
+"""Alarm: what to do with steps that a supervisor calls tampering."""
+
+from typing import Annotated, Literal, final
+
+import numpy as np
+import pydantic
+
+from realab_suite.agents.defences import base
+
+
+@base.DEFENCES.add('alarm')
+@final
+class Alarm(base.Defence):
+  """Responds to the reading of a register in which tampering is reported.
+
+  Attributes:
+    register_name: Name of the register; `register` in a file.
+    above: A larger reading is an alarm.
+    response: `screen` to leave the step out of the batch; `penalty` to learn
+      from a smaller reward.
+    penalty: What is subtracted from the reward.
+  """
+
+  kind: Literal['alarm']
+  register_name: str = pydantic.Field(alias='register')
+  above: Annotated[float, pydantic.Field(ge=-1e9, le=1e9)] = 0.5
+  response: Literal['screen', 'penalty'] = 'screen'
+  penalty: Annotated[float, pydantic.Field(ge=0, le=1e6)] = 1.0
+
+  @property
+  def reads(self) -> tuple[str, ...]:
+    return (self.register_name,)
+
+  def treat(
+      self,
+      batch: base.Batch,
+      setting: base.Setting,
+      state: tuple[()],
+      key: np.ndarray,
+  ) -> base.Treated:
+    del setting, key
+    is_alarm = batch['readings'][self.register_name] > self.above
+    is_alarm &= batch['is_valid']
+    metrics = {'alarms': float(is_alarm.mean())}
+    if self.response == 'penalty':
+      reading = batch['reading'] - self.penalty * is_alarm
+      treated = {**batch, 'reading': reading.astype(np.float32)}
+    else:
+      treated = {**batch, 'is_valid': batch['is_valid'] & ~is_alarm}
+    return base.Treated(treated, state, metrics)

@@ -1,0 +1,153 @@
+"""Base class for defences of a learner against corrupted rewards.
+
+A defence stands between the readings and the learner. It gets what the learner
+gets, and changes what the learner learns from: rewards, where returns are cut
+off, and which steps count. A design declares it as an option of its learner:
+
+    learner:
+      kind: policy_gradient
+      reward: reward
+      defence: {kind: cap, high: 10, total: 18}
+"""
+
+import abc
+from collections.abc import Mapping
+import dataclasses
+from typing import Any, NamedTuple, final
+
+import jax
+import numpy as np
+
+from realab_suite.agents import action_encoding
+from realab_suite.agents import features
+from realab_suite.agents import trusted_policies
+from realab_suite.config import registry
+from realab_suite.config import validation
+
+Batch = dict[str, Any]
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class Setting:
+  """What a defence knows of its learner.
+
+  Attributes:
+    options: Options of the learner.
+    encoder: Encoder of observations.
+    controls: Encoder of actions.
+    num_envs: Number of worlds.
+  """
+
+  options: Any
+  encoder: features.Encoder
+  controls: action_encoding.Controls
+  num_envs: int
+
+
+@final
+class Treated(NamedTuple):
+  """Result of `Defence.treat`.
+
+  Attributes:
+    batch: The batch to learn from.
+    state: State for the next call.
+    metrics: Numbers to report, by name.
+  """
+
+  batch: Batch
+  state: Any
+  metrics: Mapping[str, float] = {}
+
+
+class Defence(validation.Model):
+  """Base class for defences.
+
+  Fields of a subclass are its options, methods are its behaviour. It keeps no
+  state: what it remembers is handed in and out, so that a learner can be saved.
+
+  Attributes:
+    kind: Name under which the class is registered.
+  """
+
+  kind: str
+
+  @property
+  def reads(self) -> tuple[str, ...]:
+    """Names of further registers whose readings it uses."""
+    return ()
+
+  @property
+  def queries(self) -> tuple[str, ...]:
+    """Names of query registers in which the learner names its action."""
+    return ()
+
+  @property
+  def trusts(self) -> trusted_policies.TrustedPolicy | None:
+    """A policy that acts in some of the worlds, or `None`.
+
+    These worlds come first. The learner does not learn from their steps.
+    """
+    return None
+
+  def check(self, setting: Setting) -> None:
+    """Checks that the defence fits a learner.
+
+    Raises:
+      SpecError: If it does not.
+    """
+    del setting  # Any learner fits by default.
+
+  def initial_state(
+      self, setting: Setting, generator: np.random.Generator
+  ) -> Any:
+    """Returns the state before the first batch.
+
+    Args:
+      setting: What the defence knows of its learner.
+      generator: Random generator, for initial weights of networks.
+
+    Returns:
+      A pytree of arrays.
+    """
+    del setting, generator
+    return ()
+
+  @abc.abstractmethod
+  def treat(
+      self, batch: Batch, setting: Setting, state: Any, key: np.ndarray
+  ) -> Treated:
+    """Returns what the learner learns from instead of a batch.
+
+    Args:
+      batch: Transitions, each array `(time, worlds, ...)`: `observation`
+        (packed, see `features.Encoder.pack`) and `choice` with the `action`;
+        `reading`, `discount` and `is_valid` of the step after it, and
+        `readings` of the registers in `reads`, by name. `is_trusted`, `(time,
+        worlds)` bool, is True where the trusted policy has acted.
+      setting: What the defence knows of its learner.
+      state: State that `initial_state` or the last call returned.
+      key: Random key of this batch, two numbers.
+    """
+
+
+DEFENCES: registry.Registry[type[Defence]] = registry.Registry('defence')
+
+
+def data_of(batch: Batch, setting: Setting) -> dict[str, jax.Array]:
+  """Returns features of the observations and actions, `(time, worlds, ...)`.
+
+  Args:
+    batch: See `Defence.treat`.
+    setting: What the defence knows of its learner.
+
+  Returns:
+    `vector` and images; actions are the last elements of `vector`, one-hot or
+    as they are.
+  """
+  encoded = dict(setting.encoder.encode(batch['observation']))
+  action = jax.numpy.asarray(batch['choice']['action'])
+  if setting.controls.num_actions is not None:
+    action = jax.nn.one_hot(action, setting.controls.num_actions)
+  encoded['vector'] = jax.numpy.concatenate([encoded['vector'], action], -1)
+  return encoded

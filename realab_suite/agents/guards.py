@@ -1,0 +1,122 @@
+"""A defence at work: its state, and the worlds of its trusted policy."""
+
+from collections.abc import Mapping
+from typing import Any, final
+
+import numpy as np
+
+from realab_suite import errors
+from realab_suite.agents import base
+from realab_suite.agents import defences
+from realab_suite.agents import features
+
+
+@final
+class Guard:
+  """Applies a defence to a learner, and keeps its state."""
+
+  def __init__(
+      self,
+      defence: defences.Defence,
+      setting: defences.Setting,
+      generator: np.random.Generator,
+  ) -> None:
+    """Makes a guard.
+
+    Args:
+      defence: The defence.
+      setting: What it knows of its learner.
+      generator: Random generator of its networks.
+
+    Raises:
+      SpecError: If the defence does not fit the learner.
+    """
+    defence.check(setting)
+    self._defence, self._setting = defence, setting
+    self._state = defence.initial_state(setting, generator)
+    self._reads = {name: self._key_of(name) for name in defence.reads}
+    self._metrics: dict[str, float] = {}
+    self._trusted = None
+    if defence.trusts is not None:
+      self._trusted = defence.trusts.make(
+          setting.controls, setting.num_envs, setting.encoder.names
+      )
+
+  def steer(
+      self, choice: base.Choice, time_step: base.TimeStep, key: np.ndarray
+  ) -> base.Choice:
+    """Returns a choice with the trusted policy's actions in its worlds.
+
+    Args:
+      choice: Choice of the learner, which stays as it is.
+      time_step: Time step that it responds to.
+      key: Random key of this step, two numbers.
+    """
+    if self._trusted is None:
+      return choice
+    is_first = np.asarray(time_step.step_type) == base.FIRST
+    action = choice['action'].copy()
+    action[: self._trusted.num_worlds] = self._trusted.act(
+        time_step.observation, is_first, key
+    )
+    return {**choice, 'action': action}
+
+  def _key_of(self, register: str) -> str:
+    """Returns the key in observations of the reading of a register."""
+    names = self._setting.encoder.names
+    if (key := features.key_of(register, names)) is None:
+      raise errors.SpecError(
+          f'learner.defence: the agent does not read {register!r}; this'
+          f' environment has {sorted(names)}'
+      )
+    return key
+
+  def queries(self, choice: base.Choice) -> dict[str, np.ndarray]:
+    """Returns the values of query registers by name, each `(worlds,)`."""
+    return {name: choice['action'] for name in self._defence.queries}
+
+  def read(self, time_step: base.TimeStep) -> dict[str, Any]:
+    """Returns what it adds to the transition that ends with a time step."""
+    is_trusted = np.zeros(self._setting.num_envs, bool)
+    if self._trusted is not None:
+      is_trusted[: self._trusted.num_worlds] = True
+    readings = {
+        name: np.array(time_step.observation[key], np.float32)
+        for name, key in self._reads.items()
+    }
+    return {'is_trusted': is_trusted, 'readings': readings}
+
+  def treat(self, batch: dict[str, Any], key: np.ndarray) -> dict[str, Any]:
+    """Returns the batch to learn from, without the trusted policy's steps.
+
+    Args:
+      batch: Transitions, each array `(time, worlds, ...)`.
+      key: Random key of this batch, two numbers.
+    """
+    treated, self._state, metrics = self._defence.treat(
+        batch, self._setting, self._state, key
+    )
+    self._metrics = {n: float(value) for n, value in metrics.items()}
+    return {**treated, 'is_valid': treated['is_valid'] & ~batch['is_trusted']}
+
+  @property
+  def metrics(self) -> Mapping[str, float]:
+    """Metrics of the last batch, by name."""
+    return self._metrics
+
+  def state(self) -> dict[str, Any]:
+    """Returns the complete state, as plain data."""
+    return {
+        'defence': base.to_plain(self._state),
+        'trusted': self._trusted and self._trusted.state(),
+    }
+
+  def set_state(self, state: Mapping[str, Any]) -> None:
+    """Continues from a state that `state` returned.
+
+    Raises:
+      StateLayoutError: If it does not fit; nothing changes then.
+    """
+    self._state = base.from_plain(self._state, state['defence'])
+    if self._trusted is not None:
+      self._trusted.set_state(state['trusted'])

@@ -1,0 +1,119 @@
+"""Trusted policies: scripted policies that act in some worlds of a learner.
+
+A policy gets what an agent gets. Whoever trusts it declares so in the design;
+what it earns is not known to the learner other than by readings.
+"""
+
+from collections.abc import Collection, Mapping
+from typing import Annotated, Any, final
+
+import numpy as np
+import pydantic
+
+from realab_suite import errors
+from realab_suite import policies
+from realab_suite.agents import action_encoding
+from realab_suite.config import option_types
+from realab_suite.config import validation
+from realab_suite.policies import base as policies_base
+from realab_suite.policies import simple
+
+_Share = Annotated[float, pydantic.Field(gt=0, lt=1)]
+
+
+@final
+class TrustedPolicy(validation.Model):
+  """A policy, and the worlds of training in which it acts for the learner.
+
+  Attributes:
+    policy: Name of a registered policy.
+    options: Keyword arguments of the policy.
+    random: Share of its steps in which an action is drawn uniformly instead.
+    worlds: Share of the worlds in which it acts, rounded up: the first ones.
+  """
+
+  policy: Annotated[str, option_types.NameIn(policies_base.POLICIES)]
+  options: Mapping[str, Any] = pydantic.Field(default_factory=dict)
+  random: Annotated[float, pydantic.Field(ge=0, le=1)] = 0.0
+  worlds: _Share = 0.0625
+
+  def make(
+      self,
+      controls: action_encoding.Controls,
+      num_envs: int,
+      observed: Collection[str],
+  ) -> 'TrustedActor':
+    """Returns the policy, ready to act.
+
+    Args:
+      controls: Encoder of the learner's actions.
+      num_envs: Number of worlds of the learner.
+      observed: Keys of observations.
+
+    Raises:
+      SpecError: If the policy has other actions than the learner, reads other
+        senses, or acts in all worlds.
+    """
+    policy = policies.make(self.policy, **self.options)
+    where = f'learner.defence.trusted.policy {self.policy!r}'
+    known = controls.action_set
+    allowed = 'vectors' if known is None else known.key
+    if known is not None:
+      policy = policy.in_action_set(known)
+    if known is None or policy.action_set.key != known.key:
+      raise errors.SpecError(
+          f'{where}: has the actions of {policy.action_set.key}; allowed are'
+          f' those of the learner, {allowed}'
+      )
+    needed = (*policy.required_senses, *policy.privileged_senses)
+    senses = [name.removeprefix('senses/') for name in observed]
+    policies.check_senses(where, needed, senses, 'observed')
+    number = int(np.ceil(self.worlds * num_envs))
+    if number == num_envs:
+      raise errors.SpecError(
+          f'learner.defence.trusted.worlds: {self.worlds:g}, all of {num_envs}'
+          ' worlds; allowed are smaller shares'
+      )
+    if self.random:
+      policy = simple.Distracted(policy, self.random)
+    return TrustedActor(policy, number)
+
+
+@final
+class TrustedActor:
+  """A trusted policy, acting in the first worlds of a learner."""
+
+  def __init__(self, policy: policies_base.Policy, num_worlds: int) -> None:
+    self._policy = policy
+    self.num_worlds = num_worlds
+    self._state = policy.initial_state((num_worlds,))
+
+  def act(
+      self,
+      observation: Mapping[str, np.ndarray],
+      is_first: np.ndarray,
+      key: np.ndarray,
+  ) -> np.ndarray:
+    """Returns the indices of its actions, `(num_worlds,)`.
+
+    Args:
+      observation: Observations of all worlds by name, each `(worlds, ...)`.
+      is_first: Whether each world's episode begins here, `(worlds,)` bool.
+      key: Random key of this step, two numbers.
+    """
+    number = self.num_worlds
+    seen = {name: value[:number] for name, value in observation.items()}
+    seeds = np.random.SeedSequence([int(word) for word in key]).spawn(number)
+    keys = np.stack([seed.generate_state(2, np.uint64) for seed in seeds])
+    action, self._state = self._policy.step(
+        seen, is_first[:number], keys, self._state
+    )
+    return np.asarray(action)
+
+  def state(self) -> Any:
+    """Returns the state of the policy, as plain data."""
+    return self._state
+
+  def set_state(self, state: Any) -> None:
+    """Continues from a state that `state` returned."""
+    self._state = state
