@@ -1,0 +1,264 @@
+"""Tests of defences by hand, and of what they refuse."""
+
+from collections.abc import Sequence
+import contextlib
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip('jax', reason='jax is in the extra `agents`')
+pytest.importorskip('optax', reason='optax is in the extra `agents`')
+pytest.importorskip('equinox', reason='equinox is in the extra `agents`')
+
+from realab_suite import agents
+from realab_suite import errors
+from realab_suite import trees
+from realab_suite.agents import action_encoding
+from realab_suite.agents import defences
+from realab_suite.agents import features
+from realab_suite.config import validation
+from realab_suite.testing import probes
+from tests.agents import toys
+
+_KEY = np.array([1, 2], np.uint32)
+
+
+def _setting(num_envs: int, **options: Any) -> defences.Setting:
+  env = toys.Bandit(num_envs)
+  learner = {'kind': 'policy_gradient', 'reward': 'feedback', **options}
+  return defences.Setting(
+      agents.PolicyGradient.OPTIONS(**learner),
+      features.Encoder.from_spec(env.observation_spec()),
+      action_encoding.Controls.from_spec(env.action_spec()),
+      num_envs,
+  )
+
+
+def _batch(rewards: Sequence[Sequence[float]], **entries: Any) -> Any:
+  """Returns a batch of one row for each step."""
+  reading = np.array(rewards, np.float32)
+  return {
+      'observation': {
+          'thing': np.zeros(reading.shape, np.int32),
+          'registers/feedback': reading,
+      },
+      'choice': {'action': np.zeros(reading.shape, np.int32)},
+      'reading': reading,
+      'discount': np.ones(reading.shape, np.float32),
+      'is_valid': np.ones(reading.shape, bool),
+      'is_trusted': np.zeros(reading.shape, bool),
+      'readings': {},
+      **entries,
+  }
+
+
+def _treated(defence: Any, *batches: Any, **options: Any) -> list[Any]:
+  setting = _setting(batches[0]['reading'].shape[1], **options)
+  defence.check(setting)
+  state = defence.initial_state(setting, np.random.default_rng(0))
+  results = []
+  for batch in batches:
+    treated = defence.treat(batch, setting, state, _KEY)
+    state = treated.state
+    results.append(treated.batch)
+  return results
+
+
+def _make(kind: str, **options: Any) -> Any:
+  spec = {'kind': kind, **options}
+  return validation.validate(defences.DEFENCES.get(kind), spec, 'defence')
+
+
+def test_a_cap_credits_an_episode_up_to_its_total():
+  # World 0: 3, then 5 of which 4 fit into 7, then 0, then -2 of an excess of
+  # 1, which leaves 6. World 1: an episode ends after the first step, and the
+  # ignored action earns nothing.
+  first = _batch([[3, 6], [5, 9]], is_valid=np.array([[1, 1], [1, 0]], bool))
+  second = _batch([[0, 4], [-2, 4]])
+  one, two = _treated(_make('cap', total=7.0), first, second)
+  assert one['reading'].tolist() == [[3, 6], [4, 0]]
+  assert two['reading'].tolist() == [[0, 4], [-1, 3]]
+  # An excess is charged at its weight: 8 is 7 - 0.5, and then 6 again.
+  one, two = _treated(_make('cap', total=7.0, excess=0.5), first, second)
+  assert one['reading'].tolist() == [[3, 6], [3.5, 0]]
+  assert two['reading'].tolist() == [[0, 4], [-0.5, 2.5]]
+
+
+def test_a_cap_clips_each_reading_before_it_is_added_up():
+  batch = _batch([[20], [-20], [1]])
+  (treated,) = _treated(_make('cap', low=-1.0, high=2.0, total=2.0), batch)
+  assert treated['reading'].tolist() == [[2], [-1], [1]]
+  assert batch['reading'].tolist() == [[20], [-20], [1]]
+
+
+def test_mona_ends_returns_after_each_piece_and_adds_approval():
+  approval = np.array([[0.5], [-1], [2], [0]], np.float32)
+  batch = _batch([[1], [2], [3], [4]], readings={'said': approval})
+  mona = _make('mona', horizon=2, approval='said', query='ask', weight=2.0)
+  treated = mona.treat(batch, _setting(1), (), _KEY).batch
+  assert treated['reading'].tolist() == [[2], [0], [7], [4]]
+  assert treated['discount'].tolist() == [[1], [0], [1], [0]]
+  assert batch['discount'].tolist() == [[1]] * 4
+
+
+@pytest.mark.parametrize('response', ['screen', 'penalty'])
+def test_an_alarm_leaves_steps_out_or_charges_them(response):
+  # The second step of world 0 has a reading above the threshold, that of
+  # world 1 equals it, and the third is the ignored action of a new episode.
+  alarm = np.array([[0, 0], [0.6, 0.5], [9, 0]], np.float32)
+  is_valid = np.array([[1, 1], [1, 1], [0, 1]], bool)
+  batch = _batch([[4, 4]] * 3, readings={'bell': alarm}, is_valid=is_valid)
+  defence = _make('alarm', register='bell', response=response, penalty=3.0)
+  assert defence.reads == ('bell',)
+  treated = defence.treat(batch, _setting(2), (), _KEY).batch
+  if response == 'screen':
+    assert treated['is_valid'].tolist() == [[1, 1], [0, 1], [0, 1]]
+    assert treated['reading'].tolist() == [[4, 4]] * 3
+  else:
+    assert treated['is_valid'].tolist() == is_valid.tolist()
+    assert treated['reading'].tolist() == [[4, 4], [1, 4], [4, 4]]
+
+
+def test_orpo_charges_the_ratio_of_occupancies():
+  # Of ten worlds, the first five are the trusted policy's. It sees the things
+  # 0, 1 and 2 with 0.6, 0.3 and 0.1, the learner with 0.2, 0.3 and 0.5. So the
+  # ratios less 1 are -2/3, 0 and 4, their mean 1.87 (1.83 without the largest
+  # hundredth), its root 1.35, and the charges -0.49, 0 and 2.96.
+  generator = np.random.default_rng(1)
+  shares = [[0.6, 0.3, 0.1]] * 5 + [[0.2, 0.3, 0.5]] * 5
+  things = [generator.choice(3, 400, p=share) for share in shares]
+  thing = np.stack(things, axis=1).astype(np.int32)
+  is_trusted = np.zeros((400, 10), bool)
+  is_trusted[:, :5] = True
+  # The trusted policy earns 1 and 5, with a standard deviation of 2; the
+  # learner 100, which does not count.
+  rewards = np.full((400, 10), 100.0)
+  rewards[:, :5] = np.where(generator.random((400, 5)) < 0.5, 1.0, 5.0)
+  batch = _batch(rewards.tolist(), is_trusted=is_trusted)
+  batch['observation'] = {
+      'thing': thing, 'registers/feedback': np.zeros_like(batch['reading']),
+  }  # fmt: skip
+  trusted = {'policy': 'random', 'worlds': 0.5}
+  defence = _make('orpo', trusted=trusted, weight=0.5, gradients=200)
+  options = {'learning_rate': 0.005, 'hidden': (16,)}
+  treated = _treated(defence, batch, batch, **options)[-1]
+  charge = (batch['reading'] - treated['reading'])[:, 5:]
+  for i, expected in enumerate((-0.49, 0.0, 2.96)):
+    mean = charge[thing[:, 5:] == i].mean()
+    assert mean == pytest.approx(expected, abs=0.25)
+  # Off-policy steps are marked by `is_trusted`, and stay for others to drop.
+  assert treated['is_valid'].all()
+  clipped = _make('orpo', trusted=trusted, weight=0.5, gradients=200, clip=1.0)
+  treated = _treated(clipped, batch, batch, **options)[-1]
+  largest = (batch['reading'] - treated['reading']).max()
+  assert largest == pytest.approx(1.0, abs=0.01)
+
+
+def test_a_guarded_learner_continues_from_its_state_bit_for_bit():
+  trusted = {'policy': 'probe_worker', 'options': {'rest': 0.3}, 'worlds': 0.2}
+  learner = {
+      'kind': 'policy_gradient',
+      'reward': 'reward',
+      'defence': {'kind': 'orpo', 'trusted': trusted},
+      **probes.SMALL,
+  }
+  env = probes.load('one_push', num_envs=8)
+  spec = (env.observation_spec(), env.action_spec(), 8)
+  one, other = agents.make(learner, *spec, 1), agents.make(learner, *spec, 2)
+  time_step = env.reset()
+  for _ in range(30):
+    time_step = env.step(one.step(time_step))
+  state = one.state()
+  other.set_state(state)
+  for _ in range(15):
+    action = one.step(time_step)
+    np.testing.assert_array_equal(action, other.step(time_step))
+    # Two of eight worlds are the trusted policy's, which never pushes.
+    assert set(action[:2].tolist()) <= {0, 1}
+    time_step = env.step(action)
+  env.close()
+  assert trees.are_equal(one.state(), other.state())
+  assert one.metrics() == other.metrics()
+  assert one.metrics()['divergence'] > 0
+  plain = agents.make({**learner, 'defence': None}, *spec, 1)
+  with pytest.raises((errors.StateLayoutError, KeyError)):
+    one.set_state(plain.state())
+
+
+_TRUSTED = {'policy': 'probe_worker', 'worlds': 0.5}
+_BAD = {
+    'an unknown defence': (
+        {'kind': 'armour'},
+        "defence 'armour' is unknown; known are ['alarm', 'cap', ",
+    ),
+    'an option of another defence': (
+        {'kind': 'cap', 'horizon': 1},
+        "learner: defence: unknown key 'horizon'",
+    ),
+    'a cap without room': (
+        {'kind': 'cap', 'low': 2.0, 'high': 1.0},
+        'learner: defence: low: 2 with high 1; allowed are smaller ones',
+    ),
+    'a total below one reading': (
+        {'kind': 'cap', 'high': 12.0, 'total': 10.0},
+        'learner: defence: total: 10, which one reading of 12 exceeds',
+    ),
+    'a trusted policy with other actions': (
+        {'kind': 'orpo', 'trusted': {'policy': 'apple_seeker'}},
+        "learner.defence.trusted.policy 'apple_seeker': has the actions of"
+        ' dmlab_like v1; allowed are those of the learner, probe v1',
+    ),
+    'a trusted policy in all worlds': (
+        {'kind': 'orpo', 'trusted': {**_TRUSTED, 'worlds': 0.9}},
+        'learner.defence.trusted.worlds: 0.9, all of 4 worlds',
+    ),
+    'an unknown trusted policy': (
+        {'kind': 'orpo', 'trusted': {'policy': 'nobody'}},
+        "policy 'nobody' is unknown",
+    ),
+    'a horizon that divides nothing': (
+        {'kind': 'mona', 'horizon': 3, 'approval': 'reward', 'query': 'query'},
+        "learner.defence.query: 'query' is not a query register",
+    ),
+    'a register that nobody reads': (
+        {'kind': 'alarm', 'register': 'bell'},
+        "learner.defence: the agent does not read 'bell'",
+    ),
+    'a number': (3, 'learner: defence: must be a mapping, got 3'),
+}
+
+
+@pytest.mark.parametrize('case', _BAD)
+def test_a_defence_that_does_not_fit_is_refused_in_one_line(case):
+  defence, message = _BAD[case]
+  with (
+      pytest.raises(errors.RealabError, match=re.escape(message)) as raised,
+      contextlib.closing(probes.load('one_push', num_envs=4)) as env,
+  ):
+    agents.make(
+        {'kind': 'policy_gradient', 'reward': 'reward', 'defence': defence},
+        env.observation_spec(), env.action_spec(), num_envs=4, seed=1,
+    )  # fmt: skip
+  assert '\n' not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ('options', 'message'),
+    [
+        ({'steps_per_update': 10}, 'horizon: 4; allowed are divisors of'),
+        ({'gae_lambda': 0.95}, 'learner.gae_lambda: 0.95 with mona'),
+    ],
+)
+def test_mona_refuses_values_of_later_states(options, message):
+  with contextlib.closing(
+      probes.load('one_push', 'myopic_approval', num_envs=2)
+  ) as env:
+    learner = env.mechanism.design.learner.model_extra
+    defence = {**learner['defence'], 'horizon': 4}
+    with pytest.raises(errors.SpecError, match=message):
+      agents.make(
+          {'kind': 'policy_gradient', **learner, 'defence': defence, **options},
+          env.observation_spec(), env.action_spec(), num_envs=2, seed=1,
+      )  # fmt: skip
