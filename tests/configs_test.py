@@ -7,6 +7,7 @@ import pytest
 import yaml
 
 from realab_suite import suite
+from realab_suite.config import loading
 from realab_suite.feedback import specs
 from tests.engine import helpers
 
@@ -82,7 +83,7 @@ def test_nothing_in_a_design_is_without_use(path: pathlib.Path):
       assert register.ends_episode is not None
     else:
       assert any(written)
-      assert name in (design.learner.model_extra or {}).values()
+      assert name in loading.texts_in(design.learner.model_extra)
 
 
 @_every_file
