@@ -52,6 +52,7 @@ def fixture_registries():
         'README.md',
         'docs/attribution.md',
         'docs/composer.md',
+        'docs/defences.md',
         'docs/gymnasium.md',
         'docs/registers.md',
         'docs/your_own.md',
@@ -60,6 +61,8 @@ def fixture_registries():
 def test_python_blocks_of_a_page_run_in_order(page, registries, capsys):
   if page == 'docs/gymnasium.md':
     pytest.importorskip('gymnasium')
+  if page == 'docs/defences.md':
+    pytest.importorskip('jax')
   blocks = _python_blocks(_ROOT / page)
   assert blocks
   names = {'__name__': 'page'}
@@ -76,6 +79,9 @@ def test_python_blocks_of_a_page_run_in_order(page, registries, capsys):
         "{'reward': 1.0, 'fine': -0.5}",
     ):
       assert f'{line}\n' in printed
+  if page == 'docs/defences.md':
+    one_push, work = 'push' + ' work' * 9, 'work' + ' work' * 9
+    assert printed == f'{one_push}\ntrue 9, off by 5.0 units\n{work}\n'
   if page == 'docs/attribution.md':
     assert printed == '1.0\n1.0\n'
 
