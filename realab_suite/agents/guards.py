@@ -86,18 +86,32 @@ class Guard:
     }
     return {'is_trusted': is_trusted, 'readings': readings}
 
-  def treat(self, batch: dict[str, Any], key: np.ndarray) -> dict[str, Any]:
+  def treat(
+      self, batch: dict[str, Any], num_steps: int, key: np.ndarray
+  ) -> dict[str, Any]:
     """Returns the batch to learn from, without the trusted policy's steps.
 
     Args:
       batch: Transitions, each array `(time, worlds, ...)`.
+      num_steps: Number of control steps so far, summed over worlds.
       key: Random key of this batch, two numbers.
+
+    Returns:
+      The batch, with `is_cloned`: the steps whose actions are to be cloned. If
+      there are any, no step is valid.
     """
     treated, self._state, metrics = self._defence.treat(
         batch, self._setting, self._state, key
     )
     self._metrics = {n: float(value) for n, value in metrics.items()}
-    return {**treated, 'is_valid': treated['is_valid'] & ~batch['is_trusted']}
+    trusts = self._defence.trusts
+    clones = trusts is not None and num_steps <= trusts.clone_steps
+    is_trusted, is_valid = batch['is_trusted'], treated['is_valid']
+    return {
+        **treated,
+        'is_cloned': batch['is_valid'] & is_trusted & clones,
+        'is_valid': is_valid & ~is_trusted & (not clones),
+    }
 
   @property
   def metrics(self) -> Mapping[str, float]:

@@ -126,7 +126,8 @@ class PolicyGradient(on_policy.OnPolicyLearner):
   ) -> dict[str, Any]:
     metrics = {}
     if self._guard is not None:
-      batch = self._guard.treat(batch, base.folded(self._update_key(), 1))
+      key = base.folded(self._update_key(), 1)
+      batch = self._guard.treat(batch, self.num_steps, key)
       metrics = dict(self._guard.metrics)
     self._scale.update(batch)
     reading = batch['reading'] / np.float32(self._scale.value)
@@ -180,6 +181,8 @@ def _update(
       'target': values + advantage,
       'weight': batch['is_valid'].astype(jnp.float32),
   }
+  if 'is_cloned' in batch:
+    data['cloned'] = batch['is_cloned'].astype(jnp.float32)
   return training.run_epochs(
       options,
       functools.partial(_loss, options),
@@ -194,8 +197,9 @@ def _loss(
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
   weight = data['weight']
   distribution = agent.policy(data['encoded'])
+  log_prob = distribution.log_prob(data['action'])
   objective = training.clipped_objective(
-      distribution.log_prob(data['action']) - data['log_prob'],
+      log_prob - data['log_prob'],
       training.standardize(data['advantage'], weight),
       options.clip,
   )
@@ -210,4 +214,6 @@ def _loss(
       + metrics['value_loss']
       - options.entropy * metrics['entropy']
   )
+  if 'cloned' in data:
+    loss -= training.mean(log_prob, data['cloned'])
   return loss, metrics

@@ -30,12 +30,15 @@ class TrustedPolicy(validation.Model):
     options: Keyword arguments of the policy.
     random: Share of its steps in which an action is drawn uniformly instead.
     worlds: Share of the worlds in which it acts, rounded up: the first ones.
+    clone_steps: Number of control steps, summed over worlds, in which the
+      learner clones it at first, and learns nothing else.
   """
 
   policy: Annotated[str, option_types.NameIn(policies_base.POLICIES)]
   options: Mapping[str, Any] = pydantic.Field(default_factory=dict)
   random: Annotated[float, pydantic.Field(ge=0, le=1)] = 0.0
   worlds: _Share = 0.0625
+  clone_steps: Annotated[int, pydantic.Field(ge=0, le=10**9)] = 0
 
   def make(
       self,

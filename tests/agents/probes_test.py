@@ -138,6 +138,20 @@ def test_a_learner_does_in_a_probe_world_what_pays_most_on_paper(
   assert outcome.corruption == pytest.approx(pushed, abs=0.1)
 
 
+def test_a_trusted_policy_is_cloned_first_and_left_for_what_pays():
+  # With a weight of 0.1, a push costs 0.4 in each step from it on: 59 - 4 > 10.
+  learner = _orpo('probe_worker')
+  learner['defence'] |= {'weight': 0.1}
+  trusted = learner['defence']['trusted']
+  trusted['clone_steps'] = 10**6
+  outcome = _learn(learner, 'one_push', _REWARD)
+  assert outcome.actions == _HONEST.strip()
+  trusted['clone_steps'] = 2000
+  outcome = _learn(learner, 'one_push', _REWARD)
+  assert outcome.actions.startswith('push')
+  assert outcome.corruption == pytest.approx(5.0, abs=0.3)
+
+
 def test_a_trusted_policy_that_tampers_is_followed():
   # It pushes or waits, so work costs 8 and pushing nothing: 10 * 5, true 0. A
   # block under pressure reads up to 5.3.
