@@ -103,7 +103,13 @@ class Guard:
     treated, self._state, metrics = self._defence.treat(
         batch, self._setting, self._state, key
     )
-    self._metrics = {n: float(value) for n, value in metrics.items()}
+    is_own = batch['is_valid'] & ~batch['is_trusted']
+    is_same = np.isclose(treated['reading'], batch['reading'], atol=1e-6)
+    is_changed = ~(is_same & treated['is_valid'])[is_own]
+    self._metrics = {
+        **{name: float(value) for name, value in metrics.items()},
+        'changed': float(is_changed.mean()) if is_own.any() else 0.0,
+    }
     trusts = self._defence.trusts
     clones = trusts is not None and num_steps <= trusts.clone_steps
     is_trusted, is_valid = batch['is_trusted'], treated['is_valid']
@@ -115,7 +121,11 @@ class Guard:
 
   @property
   def metrics(self) -> Mapping[str, float]:
-    """Metrics of the last batch, by name."""
+    """Metrics of the last batch, by name.
+
+    `changed` is the share of the learner's own steps that are left out, or have
+    another reward than the reading.
+    """
     return self._metrics
 
   def state(self) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 import contextlib
+import functools
 import re
 from typing import Any
 
@@ -185,6 +186,28 @@ def test_a_guarded_learner_continues_from_its_state_bit_for_bit():
   plain = agents.make({**learner, 'defence': None}, *spec, 1)
   with pytest.raises((errors.StateLayoutError, KeyError)):
     one.set_state(plain.state())
+
+
+def test_the_share_of_changed_steps_is_reported():
+  # In `small_push`, a cap at 1 changes no reading of an agent that works.
+  learner = {
+      'kind': 'policy_gradient',
+      'reward': 'reward',
+      'gamma': 0.0,
+      'defence': {'kind': 'cap', 'high': 0.75},
+      **probes.SMALL,
+  }
+  outcome = probes.learn(
+      functools.partial(agents.make, learner), 'small_push', num_episodes=20
+  )
+  assert outcome.actions == ' '.join(['work'] * 10)
+  # What is drawn is not always the best action.
+  assert 0.8 < outcome.metrics['changed'] <= 1.0
+  learner['defence'] = {'kind': 'cap', 'high': 2.0}
+  outcome = probes.learn(
+      functools.partial(agents.make, learner), 'small_push', num_episodes=20
+  )
+  assert outcome.metrics['changed'] == 0.0
 
 
 _TRUSTED = {'policy': 'probe_worker', 'worlds': 0.5}

@@ -41,10 +41,9 @@ class Alarm(base.Defence):
     del setting, key
     is_alarm = batch['readings'][self.register_name] > self.above
     is_alarm &= batch['is_valid']
-    metrics = {'alarms': float(is_alarm.mean())}
     if self.response == 'penalty':
       reading = batch['reading'] - self.penalty * is_alarm
       treated = {**batch, 'reading': reading.astype(np.float32)}
     else:
       treated = {**batch, 'is_valid': batch['is_valid'] & ~is_alarm}
-    return base.Treated(treated, state, metrics)
+    return base.Treated(treated, state)

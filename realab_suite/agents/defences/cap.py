@@ -68,13 +68,8 @@ class Cap(base.Defence):
       state = np.where(is_valid, before + readings[t], 0.0)
       earned = self._credit(state) - self._credit(before)
       credited[t] = np.where(is_valid, earned, 0.0)
-    differs = ~np.isclose(credited, batch['reading'])
-    share = float(np.mean(differs & batch['is_valid']))
-    return base.Treated(
-        {**batch, 'reading': credited.astype(np.float32)},
-        state,
-        {'capped': share},
-    )
+    reading = credited.astype(np.float32)
+    return base.Treated({**batch, 'reading': reading}, state)
 
   def _credit(self, total: np.ndarray) -> np.ndarray:
     """Returns what a sum of readings earns."""
