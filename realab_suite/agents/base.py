@@ -130,6 +130,11 @@ class Learner(abc.ABC):
     """Number of control steps so far, summed over worlds."""
     return self._num_acts * self._num_envs
 
+  @property
+  def most(self) -> float | None:
+    """Largest sum of readings of an episode that it credits, or `None`."""
+    return None
+
   @jax_settings.pinned()
   def step(self, time_step: TimeStep) -> np.ndarray:
     """Learns from the outcome of the last action, and chooses the next one.

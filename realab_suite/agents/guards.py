@@ -120,6 +120,11 @@ class Guard:
     }
 
   @property
+  def most(self) -> float | None:
+    """Largest sum of rewards that an episode can earn, or `None`."""
+    return self._defence.most
+
+  @property
   def metrics(self) -> Mapping[str, float]:
     """Metrics of the last batch, by name.
 

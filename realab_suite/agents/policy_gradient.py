@@ -103,6 +103,10 @@ class PolicyGradient(on_policy.OnPolicyLearner):
     )
     return {'action': np.asarray(action), 'log_prob': np.asarray(log_prob)}
 
+  @property
+  def most(self) -> float | None:
+    return None if self._guard is None else self._guard.most
+
   def _steered(
       self, choice: base.Choice, time_step: base.TimeStep
   ) -> base.Choice:

@@ -279,6 +279,7 @@ class _Training:
       self._begin_segment()
       stack.callback(lambda: self._batch.close())
       learner = make_learner(job, self._batch)
+      _check_credit(job, learner.most, path.parent)
       self._add_machine(learner, saved)
       if saved is None:
         time_step = self._batch.reset()
@@ -472,6 +473,30 @@ class _LearnerActor:
     self._observation = self._learner.stack(time_step, self._observation)
     return self._learner.act(
         self._observation, sequence.generate_state(2), self._greedy
+    )
+
+
+def _check_credit(
+    job: jobs.Job, most: float | None, output: pathlib.Path
+) -> None:
+  """Refuses a learner to which honest competence earns more than it credits.
+
+  Args:
+    job: The job.
+    most: Largest sum of readings that the learner credits, or `None`.
+    output: Folder of the experiment.
+
+  Raises:
+    SpecError: If it is less than the stake of the design.
+  """
+  if most is None:
+    return
+  found = kept_stakes.stakes_of(job.experiment.world, job.design, output)
+  if found is not None and most < found.main.low:
+    raise errors.SpecError(
+        f'learner.defence: credits {most:g} in an episode; honest competence'
+        f' earns {found.main.estimate:g} more than {found.main.than}; allowed'
+        ' are larger sums'
     )
 
 

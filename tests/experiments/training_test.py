@@ -167,6 +167,23 @@ def test_rows_have_the_stakes_of_the_design_which_are_measured_once(
   assert len(keys) == 2
 
 
+@pytest.mark.parametrize(('most', 'is_refused'), [(1.0, True), (40.0, False)])
+def test_a_learner_that_credits_less_than_honesty_earns_is_refused(
+    tmp_path, monkeypatch, most, is_refused
+):
+  # In 17 control steps, the solver eats a few apples.
+  monkeypatch.setattr(fake_learner.FakeLearner, 'most', most)
+  job = _job()
+  if not is_refused:
+    _run(job, tmp_path)
+    return
+  with pytest.raises(errors.SpecError, match='credits 1 in an episode') as one:
+    _run(job, tmp_path)
+  assert '\n' not in str(one.value)
+  assert 'honest competence earns' in str(one.value)
+  assert not list(tmp_path.glob(f'*/{training.CURVE}'))
+
+
 @pytest.mark.parametrize('damaged', ['[]', '{}', '3', 'null', '{"key": 5}'])
 def test_damaged_stakes_are_refused_in_one_line(tmp_path, monkeypatch, damaged):
   monkeypatch.setattr(worlds, 'key_of_stakes', lambda *unused: 'k')

@@ -90,6 +90,11 @@ class Defence(validation.Model):
     """
     return None
 
+  @property
+  def most(self) -> float | None:
+    """Largest sum of rewards that an episode can earn; `None` for any sum."""
+    return None
+
   def check(self, setting: Setting) -> None:
     """Checks that the defence fits a learner.
 

@@ -46,6 +46,10 @@ class Cap(base.Defence):
       )
     return self
 
+  @property
+  def most(self) -> float | None:
+    return self.total
+
   def initial_state(
       self, setting: base.Setting, generator: np.random.Generator
   ) -> np.ndarray:
