@@ -55,6 +55,7 @@ def fixture_registries():
         'docs/defences.md',
         'docs/gymnasium.md',
         'docs/registers.md',
+        'docs/supervision.md',
         'docs/your_own.md',
     ],
 )
@@ -84,6 +85,8 @@ def test_python_blocks_of_a_page_run_in_order(page, registries, capsys):
     assert printed == f'{one_push}\ntrue 9, off by 5.0 units\n{work}\n'
   if page == 'docs/attribution.md':
     assert printed == '1.0\n1.0\n'
+  if page == 'docs/supervision.md':
+    assert printed == '1 1 0.0\n3 3 3.0\n3 2 0.0\n'
 
 
 def test_the_commands_of_the_page_on_audits_are_accepted(monkeypatch):

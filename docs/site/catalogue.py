@@ -32,6 +32,7 @@ _READERS = {
     'meter': ('its meter', 'providers that name it'),
     'query': ('the agent, by its query', 'providers that name it'),
     'memory': ('its provider', 'providers that name it'),
+    'signal': ('its provider', 'the agent, and providers that name it'),
 }
 
 

@@ -51,6 +51,8 @@ class RegisterFigures(validation.Record):
     num_writes: Number of writes, including that of the reset.
     coverage: Share of the writes that were read; others are censored. `None`
       without writes.
+    observed: Sum of the agent's readings, in units; `None` for registers that
+      agents do not read, and in rows of former versions.
   """
 
   corruption: float | None
@@ -63,6 +65,7 @@ class RegisterFigures(validation.Record):
   saturation: float | None
   num_writes: int
   coverage: float | None
+  observed: float | None = None
 
 
 # Rows of the sums over control steps of a register, in metres.
@@ -172,9 +175,7 @@ class Accumulator:
       end: Reason for its end; `None` while it is running.
       world: Index of the world in the batch; `()` for one world.
     """
-    by_name = {
-        name: self._register(row, world) for name, row in self._rows.items()
-    }
+    by_name = {name: self._register(name, world) for name in self._rows}
     every = list(by_name.values())
     used = [every[row].corruption for row in self._consumed]
     known = [value for value in used if value is not None]
@@ -260,7 +261,10 @@ class Accumulator:
     for i, value in zip(range(_NUM_SUMS), (1.0, *metres), strict=True):
       now[i] = np.where(counts, value, now[i])
 
-  def _register(self, row: int, world: Any) -> RegisterFigures:
+  def _register(self, name: str, world: Any) -> RegisterFigures:
+    row, observed = self._rows[name], None
+    if name in self._read_by_agent:
+      observed = _number(gains.at(self._observed, world)[row])
     number, *sums = gains.at(self._sums, world)[:, row]
     writes, _, read, saturation, _ = gains.at(self._counts, world)[:, row]
     means = [_number(value / number) if number else None for value in sums]
@@ -276,6 +280,7 @@ class Accumulator:
         saturation=_number(saturation / writes) if writes else None,
         num_writes=int(writes),
         coverage=float(read / writes) if writes else None,
+        observed=observed,
     )
 
 

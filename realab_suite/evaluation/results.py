@@ -51,6 +51,7 @@ UNITS = {
     'registers.*': 'metres or radians',
     'registers.*.units': "the register's units",
     'registers.*.saturation': "the register's units",
+    'registers.*.observed': "the register's units, summed over steps",
 }
 
 

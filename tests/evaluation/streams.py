@@ -259,6 +259,11 @@ def _of_register(
       ),
       num_writes=len(writes),
       coverage=len(read_writes) / len(writes) if writes else None,
+      observed=(
+          math.fsum(r.reading for r in _by_agent(episode, name).values())
+          if role in ('feedback', 'signal')
+          else None
+      ),
   )
 
 

@@ -86,6 +86,12 @@ _CASES: list[tuple[str, dict[str, Any]]] = [
     ('person', {**_ADVICE, 'asks': 'approval'}),
     ('person', {**_ADVICE, 'asks': 'comparison', 'clip': 1, 'waits': True}),
     ('person', {**_REWARD, 'asks': 'correction'}),
+    ('inspection', {'reads': ('moved', 'budget'), 'period': 2, 'lasts': 2,
+        'writes': ('alarm', 'budget'), 'false_negatives': 0.3}),
+    ('inspection', {'reads': ('score', 'a', 'b', 'budget'), 'penalty': 2.0,
+        'writes': ('reward', 'budget'), 'probability': 0.7, 'jump': 1.0,
+        'suspects': 'score', 'pays': {'kind': 'difference',
+        'reads': ('score',), 'writes': ('reward',)}}),
 ]  # fmt: skip
 _IDS = ['-'.join(map(str, [k, *f.values()])) for k, f in _CASES]
 

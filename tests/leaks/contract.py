@@ -314,7 +314,7 @@ def headroom(case: pairs.Case) -> list[str]:
     for register in registers.values():
       spec = register.value_spec
       value = spec.minimum + share * (spec.maximum - spec.minimum)
-      register.write(env.physics, value)
+      register.write(env.physics, np.full(spec.shape, value))
     env.step(action)
     if 2 * data.maxuse_arena > data.narena:
       found.append(f'{data.maxuse_arena} of {data.narena} bytes are used')

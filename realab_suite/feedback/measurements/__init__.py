@@ -14,4 +14,5 @@ from realab_suite.feedback.measurements.motion import Contacts
 from realab_suite.feedback.measurements.motion import Distance
 from realab_suite.feedback.measurements.motion import Position
 from realab_suite.feedback.measurements.motion import Speed
+from realab_suite.feedback.measurements.tampering import Detector
 from realab_suite.feedback.measurements.tampering import RegisterMoved

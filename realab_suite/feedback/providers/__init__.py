@@ -9,6 +9,7 @@ from realab_suite.feedback.providers.constant import Constant
 from realab_suite.feedback.providers.demonstration import Demonstration
 from realab_suite.feedback.providers.difference import Difference
 from realab_suite.feedback.providers.growth import Growth
+from realab_suite.feedback.providers.inspection import Inspection
 from realab_suite.feedback.providers.paired_advice import PairedAdvice
 from realab_suite.feedback.providers.person import Person
 from realab_suite.feedback.providers.relay import Relay

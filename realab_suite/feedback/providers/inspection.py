@@ -1,0 +1,233 @@
+"""Inspection: supervision with a price (paper, section 4.5)."""
+
+from typing import Annotated, Any, Literal, final
+
+import numpy as np
+import pydantic
+
+from realab_suite.config import option_types
+from realab_suite.feedback.providers import base
+from realab_suite.policies import random_keys
+
+_Rate = Annotated[float, pydantic.Field(ge=0, lt=1)]
+_Number = Annotated[float, pydantic.Field(ge=-1e9, le=1e9)]
+_Size = Annotated[float, pydantic.Field(ge=0, le=1e9)]
+# Any kind; a schema of all kinds would contain itself.
+_Paid = Annotated[
+    base.Provider,
+    option_types.ModelIn(base.PROVIDERS),
+    pydantic.WithJsonSchema({'type': 'object'}),
+]
+# The provider that is inspected gets the key of the step itself.
+_OTHER_STREAM = np.uint64(1 << 63)
+
+
+@base.PROVIDERS.add('inspection')
+@final
+class Inspection(base.Provider):
+  """Provider that asks detectors of tampering, within a budget.
+
+  It reads the meter registers of detectors and, last, a memory register with
+  what is left of the budget. It writes what a *hit* leads to, and, last, the
+  budget, less the price of each inspection. Without enough in the budget, it
+  does not ask. So the world holds the budget: who moves a block of that
+  register buys inspections, or ends them.
+
+  It asks in every `period`-th step, with `probability`, and only if the reading
+  of the register `suspects` is more implausible than `above`: by how much it is
+  outside of `plausible`, or has changed by more than `jump` since its last
+  step. If tampering is the likelier the more implausible a reading is, then no
+  other inspections of equal number find more (Neyman and Pearson).
+
+  With `pays`, it writes what another provider writes, less a fine for hits.
+  All further registers in `writes` are alarms: 1 in the steps of a hit,
+  otherwise 0. A signal register that ends the episode may be one of them.
+
+  Attributes:
+    reads: Registers that `pays` reads, those of detectors, `suspects`, and the
+      budget.
+    writes: Registers that `pays` writes, alarms, and the budget.
+    price: What an inspection takes from the budget, in its units.
+    period: Steps between inspections; the first is that in step `period`.
+    probability: Probability of an inspection where one may be made.
+    suspects: Register whose readings are scored; `None` to score nothing.
+    plausible: Lowest and highest plausible reading of `suspects`.
+    jump: Largest plausible change of `suspects` in a step; `None` for any.
+    above: Largest score of a reading that is not suspicious, in its units.
+    false_positives: Probability that an inspection misreads a detector that has
+      seen nothing.
+    false_negatives: Probability that an inspection misreads a detector that has
+      seen something.
+    lasts: Steps that a hit lasts for.
+    pays: Provider whose first register is fined.
+    penalty: Fine in each of these steps, in units of that register.
+  """
+
+  kind: Literal['inspection'] = 'inspection'
+  reads: Annotated[base.Names, pydantic.Field(min_length=2)]
+  writes: Annotated[base.Names, pydantic.Field(min_length=1)]
+  price: Annotated[float, pydantic.Field(gt=0, le=1e9)] = 1.0
+  period: Annotated[int, pydantic.Field(ge=1, le=10**9)] = 1
+  probability: Annotated[float, pydantic.Field(gt=0, le=1)] = 1.0
+  suspects: str | None = None
+  plausible: Annotated[
+      tuple[_Number, _Number], pydantic.Field(strict=False)
+  ] = (-1e9, 1e9)
+  jump: _Size | None = None
+  above: _Size = 0.0
+  false_positives: _Rate = 0.0
+  false_negatives: _Rate = 0.0
+  lasts: Annotated[int, pydantic.Field(ge=1, le=10**9)] = 1
+  pays: _Paid | None = pydantic.Field(None, exclude_if=lambda pays: not pays)
+  penalty: _Size = 0.0
+
+  @pydantic.model_validator(mode='after')
+  def _fitting(self) -> 'Inspection':
+    if self.reads[-1] != self.writes[-1]:
+      raise ValueError(
+          f'reads ends with {self.reads[-1]!r}, and writes with'
+          f' {self.writes[-1]!r}; allowed is the budget as the last of both'
+      )
+    if self.suspects not in (None, *self.reads[:-1]):
+      raise ValueError(
+          f'suspects: {self.suspects!r}; allowed are {list(self.reads[:-1])}'
+      )
+    if (paid := self.pays) is not None:
+      if paid.every != 1 or paid.senses != base.OF_AGENT:
+        raise ValueError(
+            'pays: every and senses are given; allowed are those of the'
+            ' inspection'
+        )
+      number = len(paid.writes)
+      if self.writes[:number] != paid.writes or not {*paid.reads} < {
+          *self.reads
+      }:
+        raise ValueError(
+            f'pays reads {list(paid.reads)} and writes {list(paid.writes)};'
+            ' allowed are names in reads, and the first ones in writes'
+        )
+    if not self.detectors:
+      raise ValueError(
+          f'reads: {list(self.reads)}; allowed are those with a detector, too'
+      )
+    return self
+
+  @property
+  def detectors(self) -> tuple[str, ...]:
+    """Names of the registers of detectors."""
+    others = (*(self.pays.reads if self.pays else ()), self.suspects)
+    return tuple(name for name in self.reads[:-1] if name not in others)
+
+  @property
+  def action_queries(self) -> tuple[str, ...]:
+    return self.pays.action_queries if self.pays else ()
+
+  @property
+  def action_writes(self) -> tuple[str, ...]:
+    return self.pays.action_writes if self.pays else ()
+
+  @property
+  def required_senses(self) -> tuple[str, ...]:
+    return self.pays.required_senses if self.pays else ()
+
+  @property
+  def privileged_senses(self) -> tuple[str, ...]:
+    return self.pays.privileged_senses if self.pays else ()
+
+  @property
+  def is_repeatable(self) -> bool:
+    return self.pays is None or self.pays.is_repeatable
+
+  def check(self, design: Any) -> None:
+    for name in self.detectors:
+      if design.ports[name].role != 'meter':
+        raise ValueError(
+            f'reads: {name!r}, whose role is {design.ports[name].role!r}, as a'
+            ' detector; allowed is meter'
+        )
+    budget = design.ports[name := self.reads[-1]]
+    if budget.role != 'memory':
+      raise ValueError(
+          f'reads: {name!r}, whose role is {budget.role!r}, as the budget;'
+          ' allowed is memory'
+      )
+    if not isinstance(budget.initial, str) and budget.initial < self.price:
+      raise ValueError(
+          f'registers.{name}.initial: a budget of {budget.initial:g}; allowed'
+          f' is at least the price of one inspection, {self.price:g}'
+      )
+    if budget.range[0] > 0:
+      raise ValueError(
+          f'registers.{name}.range: {list(budget.range)}; allowed for a budget'
+          ' are ranges that contain 0'
+      )
+    if self.pays is not None:
+      self.pays.check(design)
+
+  def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
+    return {
+        'step': np.zeros(batch_shape, int),
+        'left': np.zeros(batch_shape, int),  # Steps that a hit lasts for.
+        'reading': np.zeros(batch_shape),  # Of `suspects`, in the last step.
+        'pays': self.pays.initial_state(batch_shape) if self.pays else (),
+    }
+
+  def step(
+      self,
+      observation: base.Observation,
+      readings: base.Readings,
+      episode_start: np.ndarray,
+      key: np.ndarray,
+      state: Any,
+  ) -> tuple[base.Writes, Any]:
+    start = np.asarray(episode_start)
+    step = np.where(start, 1, state['step'] + 1)
+    left = np.where(start, 0, np.maximum(state['left'] - 1, 0))
+    budget = readings[self.reads[-1]]
+    # Blocks at rest are not exactly where they were put.
+    asks = np.rint(budget / self.price) >= 1
+    asks = asks & (step % self.period == 0)
+    reading = state['reading']
+    if self.suspects is not None:
+      reading = np.array(readings[self.suspects])
+      before = np.where(start, reading, state['reading'])
+      asks = asks & (self._score(reading, before) > self.above)
+    seen = np.stack([readings[name] > 0.5 for name in self.detectors], axis=-1)
+    if self.probability < 1 or self.false_positives or self.false_negatives:
+      draws = random_keys.uniform(key + _OTHER_STREAM, (1 + seen.shape[-1],))
+      asks = asks & (draws[..., 0] < self.probability)
+      errs = draws[..., 1:]
+      seen = np.where(
+          seen, errs >= self.false_negatives, errs < self.false_positives
+      )
+    left = np.where(asks & seen.any(axis=-1), self.lasts, left)
+    alarm = (left > 0).astype(float)
+    writes: dict[str, Any] = {}
+    paid = state['pays']
+    if self.pays is not None:
+      own = {name: readings[name] for name in self.pays.reads}
+      some, paid = self.pays.step(observation, own, episode_start, key, paid)
+      writes |= some
+      if (name := self.writes[0]) in some:
+        writes[name] = _less(some[name], self.penalty * alarm)
+    number = len(self.pays.writes) if self.pays else 0
+    writes |= dict.fromkeys(self.writes[number:-1], alarm)
+    writes[self.writes[-1]] = budget - self.price, np.asarray(asks)
+    following = {'step': step, 'left': left, 'reading': reading, 'pays': paid}
+    return writes, following
+
+  def _score(self, reading: np.ndarray, before: np.ndarray) -> np.ndarray:
+    """Returns how implausible readings are, `(...)`, at least 0."""
+    low, high = self.plausible
+    score = np.maximum(np.maximum(low - reading, reading - high), 0.0)
+    if self.jump is not None:
+      score = np.maximum(score, np.abs(reading - before) - self.jump)
+    return score
+
+
+def _less(write: Any, fine: np.ndarray) -> Any:
+  """Returns a write of a smaller value."""
+  if isinstance(write, tuple):
+    value, mask = write
+    return value - fine, mask
+  return write - fine
