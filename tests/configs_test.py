@@ -80,9 +80,8 @@ def test_nothing_in_a_design_is_without_use(path: pathlib.Path):
       assert any(read)
     elif register.role == 'signal':
       assert any(written)
-      extras = (design.learner.model_extra or {}) if design.learner else {}
-      reads = name in loading.texts_in(extras.get('defence'))
-      assert reads or register.ends_episode is not None
+      is_read = name in loading.texts_in(design.learner.model_extra)
+      assert is_read or register.ends_episode is not None
     else:
       assert any(written)
       assert name in loading.texts_in(design.learner.model_extra)

@@ -313,6 +313,7 @@ class _Speaking(providers.Provider):
       key: np.ndarray,
       state: Any,
   ) -> Any:
+    assert [*readings] == ['q']  # No detector, and no budget.
     asked = readings['q']
     if (asked == 2).all():
       return {'s': np.full(asked.shape, 7.0)}, state
