@@ -51,6 +51,7 @@ demonstration is read before anything was pushed.
     outcome.actions  # 'push work work work work work work work work work'
 """
 
+import abc
 from collections.abc import Callable, Mapping
 import contextlib
 import types
@@ -246,9 +247,9 @@ class _Always(policies_base.Policy):
     return ACTIONS
 
   @property
+  @abc.abstractmethod
   def action(self) -> str:
     """Name of the action."""
-    raise NotImplementedError
 
   def step(
       self,
