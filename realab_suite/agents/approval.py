@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from realab_suite import errors
 from realab_suite.agents import base
 from realab_suite.agents import features
 from realab_suite.agents import networks
@@ -40,9 +41,18 @@ class ApprovalOptions(on_policy.OnPolicyOptions):
     follows_reading: True to predict the feedback from the last reading as well.
       A base block that was moved changes all later readings, and no later
       action should be credited with that.
+    scale: Standard deviation that divides the feedback: that of the `reading`,
+      or that of its `change` in a step. The first grows with the displacement
+      of a block until networks no longer resolve the feedback itself.
     exploration: Final probability of a random action (`q`).
     exploration_steps: Number of control steps of all worlds after which the
       probability of a random action has fallen from 1 to `exploration` (`q`).
+    floor: Smallest probability of each action and query (`policy_gradient`). An
+      action that the policy has given up is still taken, and can be learned
+      again.
+    query_delay: 0 if a reading is the feedback on the query of its own step; 1
+      if it is the feedback on the query and the observation of the step before,
+      as in the paper's example. It has to be that of the provider.
   """
 
   query: str
@@ -50,8 +60,11 @@ class ApprovalOptions(on_policy.OnPolicyOptions):
   entropy: base.Weight = 0.01
   clip: base.Fraction = 0.2
   follows_reading: bool = False
+  scale: Literal['reading', 'change'] = 'reading'
   exploration: base.Fraction = 0.05
   exploration_steps: base.Positive = 200_000
+  floor: base.Fraction = 0.0
+  query_delay: Literal[0, 1] = 0
 
   @property
   def queries(self) -> tuple[str, ...]:
@@ -104,9 +117,16 @@ class _ApprovalLearner(on_policy.OnPolicyLearner):
 
   def __init__(self, *args: Any, **kwargs: Any) -> None:
     super().__init__(*args, **kwargs)
-    self._controls.check_discrete(self._options.kind)
     for query in self._options.queries:
       self._controls.check_query('learner', query)
+    num_actions = self._controls.check_discrete(self._options.kind)
+    if self._options.floor * num_actions >= 1.0:
+      raise errors.SpecError(
+          f'learner.floor: {self._options.floor}; allowed are numbers below'
+          f' 1/{num_actions}, because there are {num_actions} actions'
+      )
+    # The last transition, whose feedback comes with the next one.
+    self._before: dict[str, Any] | None = None
     # Myopic: discount 0, so the scale is that of single readings.
     self._scale = training.FeedbackScale(self._num_envs, 0.0)
 
@@ -137,12 +157,21 @@ class _ApprovalLearner(on_policy.OnPolicyLearner):
         self._encoder,
         self._networks[0],
         observation,
-        training.exploration(self._options, self.num_steps),
+        self._exploration,
         keys['act'],
         self._query_keys(keys),
         greedy,
     )
     return jax.tree.map(np.asarray, choice)
+
+  @property
+  def _exploration(self) -> np.float32 | None:
+    """Probability of a uniformly drawn action; `None` if there are none."""
+    options = self._options
+    if options.form == 'q':
+      return training.exploration(options, self.num_steps)
+    num_actions = self._controls.check_discrete(options.kind)
+    return np.float32(options.floor * num_actions) if options.floor else None
 
   @abc.abstractmethod
   def _query_keys(self, keys: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -160,16 +189,34 @@ class _ApprovalLearner(on_policy.OnPolicyLearner):
         self._encoder,
         self._networks[0],
         observation,
-        training.exploration(self._options, self.num_steps),
+        self._exploration,
     )
+
+  def _observe(
+      self, transition: dict[str, Any], observation: features.Packed
+  ) -> None:
+    if self._options.query_delay:
+      before, self._before = self._before, transition
+      if before is None:
+        return
+      # The feedback on the last query of an episode never comes: the step after
+      # it begins the next one.
+      transition = {
+          **transition,
+          'observation': before['observation'],
+          'choice': before['choice'],
+          'is_valid': before['is_valid'] & transition['is_valid'],
+      }
+    super()._observe(transition, observation)
 
   def _learn(
       self, batch: dict[str, Any], observation: features.Packed
   ) -> dict[str, Any]:
     del observation  # There is no feedback on it yet.
-    self._scale.update(batch)
-    scale = np.float32(self._scale.value)
     last = batch['observation'][self._reading].reshape(batch['reading'].shape)
+    origin = last if self._options.scale == 'change' else 0.0
+    self._scale.update({**batch, 'reading': batch['reading'] - origin})
+    scale = np.float32(self._scale.value)
     self._networks, metrics = _update(
         self._options,
         self._encoder,
@@ -180,10 +227,12 @@ class _ApprovalLearner(on_policy.OnPolicyLearner):
     return {**metrics, 'feedback_scale': self._scale.value}
 
   def _memory(self) -> dict[str, Any]:
-    return {**super()._memory(), 'scale': self._scale.state()}
+    before = {'before': self._before} if self._options.query_delay else {}
+    return {**super()._memory(), 'scale': self._scale.state(), **before}
 
   def _set_memory(self, memory: dict[str, Any]) -> None:
     super()._set_memory(memory)
+    self._before = memory.get('before')
     self._scale.set_state(memory['scale'])
 
 
@@ -219,7 +268,11 @@ def _log_probs(
 ) -> jax.Array:
   """Returns the logarithm of each action's probability, `(..., actions)`."""
   if 'policy' in agent:
-    return jax.nn.log_softmax(agent['policy'](encoded))
+    log_probs = jax.nn.log_softmax(agent['policy'](encoded))
+    if exploration is None:
+      return log_probs
+    uniform = jnp.log(exploration / log_probs.shape[-1])
+    return jnp.logaddexp(log_probs + jnp.log1p(-exploration), uniform)
   values = agent['values'](encoded)
   num_actions = values.shape[-1]
   best = jax.nn.one_hot(jnp.argmax(values, axis=-1), num_actions)
@@ -231,12 +284,13 @@ def _choose(
     encoder: features.Encoder,
     agent: dict[str, Any],
     observation: features.Packed,
-    exploration: jax.Array,
+    exploration: jax.Array | None,
     act_key: jax.Array,
     query_keys: jax.Array,
     greedy: bool,
 ) -> dict[str, jax.Array]:
-  log_probs = _log_probs(agent, encoder.encode(observation), exploration)
+  encoded = encoder.encode(observation)
+  log_probs = _log_probs(agent, encoded, exploration)
   action = networks.draw(act_key, log_probs)
   if greedy:
     action = jnp.argmax(log_probs, axis=-1)
@@ -244,6 +298,10 @@ def _choose(
   logits = log_probs if 'policy' in agent else jnp.zeros_like(log_probs)
   drawn = [networks.draw(key, logits) for key in query_keys]
   asked = jnp.stack(drawn or [action], axis=-1)
+  if 'policy' in agent:
+    # Learn as if the policy had drawn the action: its gradient for an action
+    # that only the floor has drawn would vanish.
+    log_probs = _log_probs(agent, encoded, None)
   log_prob = jnp.take_along_axis(log_probs, asked, axis=-1)
   return {'action': action, 'asked': asked, 'log_prob': log_prob}
 
@@ -253,7 +311,7 @@ def _probabilities(
     encoder: features.Encoder,
     agent: dict[str, Any],
     observation: features.Packed,
-    exploration: jax.Array,
+    exploration: jax.Array | None,
 ) -> jax.Array:
   return jnp.exp(_log_probs(agent, encoder.encode(observation), exploration))
 

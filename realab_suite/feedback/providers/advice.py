@@ -9,6 +9,11 @@ from realab_suite import policies
 from realab_suite.config import option_types
 from realab_suite.feedback.providers import base
 
+# Learners that credit feedback to the query of the current step, or of the
+# previous one if their option `query_delay` is 1.
+_LEARNERS = ('value_advice', 'decoupled_approval')
+_QUERIES = ('current', 'previous')
+
 
 class Advice(policies.Follower, base.Provider):
   """Base class of providers that write values of actions in query registers.
@@ -34,6 +39,11 @@ class Advice(policies.Follower, base.Provider):
     """Value function that computes the advice."""
     return policies.make_value_function(self.value_function, **self.options)
 
+  @property
+  def delay(self) -> int:
+    """Number of steps by which the advice comes after its query."""
+    return 0
+
   def check(self, design: Any) -> None:
     policies.check_action_set(self.action_set, design, self.kind)
     article = 'the' if len(self.reads) == 1 else 'a'
@@ -43,3 +53,13 @@ class Advice(policies.Follower, base.Provider):
             f'{self.kind} reads {article} query from {query!r}, whose role is'
             f' {design.ports[query].role!r}; allowed is query'
         )
+    learner = design.learner
+    if learner is None or learner.kind not in _LEARNERS:
+      return
+    if getattr(learner, 'query_delay', 0) != self.delay:
+      evaluated, expected = _QUERIES[self.delay], _QUERIES[1 - self.delay]
+      raise ValueError(
+          f'query_delay: {self.delay} evaluates the query of the {evaluated}'
+          f' step, but the learner {learner.kind} expects the value of the'
+          f' {expected} one; allowed is the same query_delay in both'
+      )

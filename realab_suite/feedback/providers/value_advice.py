@@ -8,9 +8,6 @@ from realab_suite.feedback.providers import advice
 from realab_suite.feedback.providers import base
 from realab_suite.feedback.providers import queries
 
-# Learners that credit the feedback of a step to the query of the same step.
-_WITHOUT_DELAY = ('value_advice', 'decoupled_approval')
-
 
 @base.PROVIDERS.add('value_advice')
 @final
@@ -26,22 +23,17 @@ class ValueAdvice(advice.Advice):
     options: See `Advice`.
     query_delay: 0 to evaluate the query of the current step in the observation
       of the current step; 1 to evaluate the query of the previous step in the
-      observation of the previous step, as in the paper's example.
+      observation of the previous step, as in the paper's example. The learner
+      needs the same option.
   """
 
   kind: Literal['value_advice'] = 'value_advice'
   reads: base.OneName
   query_delay: Literal[0, 1] = 0
 
-  def check(self, design: Any) -> None:
-    super().check(design)
-    learner = None if design.learner is None else design.learner.kind
-    if self.query_delay and learner in _WITHOUT_DELAY:
-      raise ValueError(
-          'query_delay: 1 evaluates the query of the previous step, but the'
-          f' learner {learner} expects the value of the current query; allowed'
-          ' is 0, or another learner'
-      )
+  @property
+  def delay(self) -> int:
+    return self.query_delay
 
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
     num_actions = len(self.action_set)
