@@ -299,8 +299,8 @@ def _choose(
   drawn = [networks.draw(key, logits) for key in query_keys]
   asked = jnp.stack(drawn or [action], axis=-1)
   if 'policy' in agent:
-    # Learn as if the policy had drawn the action: its gradient for an action
-    # that only the floor has drawn would vanish.
+    # Learn as if the policy had drawn the action. The gradient for an action
+    # that only the floor has drawn would vanish otherwise.
     log_probs = _log_probs(agent, encoded, None)
   log_prob = jnp.take_along_axis(log_probs, asked, axis=-1)
   return {'action': action, 'asked': asked, 'log_prob': log_prob}
@@ -369,6 +369,7 @@ def policy_objective(
     old_log_prob: jax.Array,
     advantage: jax.Array,
     clip: float,
+    floor: float = 0.0,
 ) -> jax.Array:
   """Returns the objective of each sample, `(...)`.
 
@@ -383,10 +384,14 @@ def policy_objective(
       was drawn, with the shape of `asked`.
     advantage: Feedback minus the expected feedback, standardised, `(...)`.
     clip: Largest change of a probability ratio in one update.
+    floor: Probability below which an action is not made less likely.
   """
   chosen = jax.nn.one_hot(asked, log_probs.shape[-1])
   log_prob = jnp.sum(chosen * log_probs[..., jnp.newaxis, :], axis=-1)
   signed = advantage[..., jnp.newaxis] * signs(asked)
+  if floor:
+    is_rare = old_log_prob < jnp.log(floor)
+    signed = jnp.where(is_rare, jnp.maximum(signed, 0.0), signed)
   objective = training.clipped_objective(log_prob - old_log_prob, signed, clip)
   return jnp.mean(objective, axis=-1)
 
@@ -404,6 +409,7 @@ def _policy_loss(
       data['log_prob'],
       training.standardize(data['advantage'], weight),
       options.clip,
+      options.floor,
   )
   error = _expected(agent, data) - data['feedback']
   entropy = -jnp.sum(jnp.exp(log_probs) * log_probs, axis=-1)
