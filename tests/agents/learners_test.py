@@ -28,6 +28,7 @@ _ONE = ('query',)
 _PAIR = ('query', 'other')
 _DECOUPLED = {'approval': 'feedback'}
 _PAIRED = {'approval': 'feedback', 'other_query': 'other'}
+_ADVISED = {'advice': 'feedback', 'query': 'query'}
 _Q = {'form': 'q', 'exploration_steps': 2000, 'exploration': 0.1}
 
 
@@ -83,6 +84,17 @@ _CASES: dict[str, tuple[Any, str, dict[str, Any]]] = {
             ('paired_q', 'decoupled_approval', _PAIR, {**_PAIRED, **_Q}),
         )
     },
+    **{
+        name: (
+            lambda: toys.Bandit(16, _ACTIONS, queries=_ONE, is_delayed=True),
+            kind,
+            {**options, 'query': 'query', 'query_delay': 1},
+        )
+        for name, kind, options in (
+            ('delayed', 'value_advice', {'advice': 'feedback'}),
+            ('delayed_q', 'decoupled_approval', {**_DECOUPLED, **_Q}),
+        )
+    },
 }
 
 
@@ -108,6 +120,29 @@ def test_following_the_readings_helps_where_they_all_drift(
   # With this rate of learning, values are rough.
   assert scores[True] > fewest
   assert scores[False] < scores[True] - 0.1
+
+
+@pytest.mark.parametrize(
+    ('delay', 'expected'),
+    # With a delay, the last query of an episode never gets feedback, and the
+    # first step has none to give.
+    [(0, [True] * 4 + [False]), (1, [True] * 3 + [False] * 2)],
+)
+def test_a_reading_is_credited_to_its_query_and_the_observation_of_then(
+    delay, expected
+):
+  env = toys.Bandit(50, _ACTIONS, queries=_ONE, is_delayed=delay, length=4)
+  learner = _make(
+      env, 'value_advice', **_ADVISED, query_delay=delay, steps_per_update=99
+  )
+  _run(learner, env, 16)
+  for i, transition in enumerate(learner.state()['memory']['transitions']):
+    assert (transition['is_valid'] == expected[i % 5]).all()
+    if expected[i % 5]:
+      asked = transition['choice']['asked'][:, 0]
+      good = asked == transition['observation']['thing']
+      np.testing.assert_array_equal(transition['reading'], good)
+  assert i + delay == 14
 
 
 # In one test, because compiling a learner takes longer than training it.
@@ -265,6 +300,10 @@ def test_an_unused_query_is_zero():
             },
             "query_policy: .*'independent_action'.*got 'taken_action'",
         ),
+        (
+            {'kind': 'value_advice', **_ADVISED, 'query_delay': 2},
+            'learner: query_delay: must be 0 or 1, got 2',
+        ),
     ],
 )
 def test_a_wrong_learner_is_refused_in_one_line(spec, problem):
@@ -288,6 +327,37 @@ def test_a_query_register_has_to_hold_every_action():
   env = toys.Bandit(2, _ACTIONS - 1, queries=('query',))
   with pytest.raises(errors.SpecError, match=r"'query' holds \[0, 12\]"):
     _make(env, 'value_advice', advice='feedback', query='query')
+
+
+def test_a_scale_of_changes_does_not_grow_with_a_displacement():
+  scales = {}
+  for scale in ('reading', 'change'):
+    env = toys.Bandit(16, _ACTIONS, queries=_ONE, drift=2.0)
+    learner = _make(env, 'value_advice', **_ADVISED, scale=scale)
+    _run(learner, env, 129)
+    scales[scale] = learner.metrics()['feedback_scale']
+  # A walk of 128 steps of 2: a variance of 4 * t, 4 * 64 on average.
+  assert scales['reading'] == pytest.approx(16.0, abs=3.0)
+  # The feedback adds less than 2 * 1/14 to the variance of a change, 4.
+  assert scales['change'] == pytest.approx(2.0, abs=0.1)
+
+
+@pytest.mark.parametrize(('floor', 'is_allowed'), [(0.1, False), (0.07, True)])
+def test_a_floor_has_to_leave_room_for_all_actions(floor, is_allowed):
+  env = toys.Bandit(40, _ACTIONS, queries=_ONE)
+  if not is_allowed:
+    with pytest.raises(errors.SpecError, match=r'0\.1; .* below 1/14, because'):
+      _make(env, 'value_advice', **_ADVISED, floor=floor)
+    return
+  learner = _make(env, 'value_advice', **_ADVISED, floor=floor)
+  _run(learner, env, 80)
+  observation = env.reset().observation
+  probabilities = learner.probabilities(observation)
+  best = probabilities.argmax(axis=1)
+  np.testing.assert_array_equal(best, observation['thing'])
+  # The best action has what the floor of 13 others leaves.
+  assert probabilities.min() == pytest.approx(0.07, abs=1e-3)
+  assert probabilities.max() == pytest.approx(1 - 13 * 0.07, abs=0.01)
 
 
 def test_other_specs_are_refused():

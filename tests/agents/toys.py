@@ -17,10 +17,14 @@ class ToyStep(NamedTuple):
 class Bandit:
   """Shows one of three things; the best action is the one of that number.
 
-  Nothing ends. `feedback` is the value of a register after a step. `drift` is
-  added to it from step to step, in standard deviations, as if its base block
-  moved all the time.
+  `feedback` is the value of a register after a step. `drift` is added to it
+  from step to step, in standard deviations, as if its base block moved all the
+  time. With `is_delayed`, the feedback comes one step later; the first step of
+  an episode shows `NO_FEEDBACK`. Episodes have `length` steps, the one that
+  begins them not counted; 0 for one without end.
   """
+
+  NO_FEEDBACK = -9.0
 
   num_envs: int
   num_actions: int = 3
@@ -28,12 +32,16 @@ class Bandit:
   queries: tuple[str, ...] = ()
   shows: str = 'reward'
   drift: float = 0.0
+  is_delayed: bool = False
+  length: int = 0
 
   def __post_init__(self) -> None:
     self._generator = np.random.default_rng(self.seed)
     self.scores: list[float] = []
     self.feedback: list[float] = []
     self._offset = np.zeros(self.num_envs)
+    self._num_steps = 0
+    self._waiting = np.full(self.num_envs, self.NO_FEEDBACK)
 
   def observation_spec(self) -> dict[str, specs.Array]:
     return {
@@ -51,10 +59,15 @@ class Bandit:
     )
 
   def reset(self) -> ToyStep:
+    self._num_steps = 0
+    self._waiting = np.full(self.num_envs, self.NO_FEEDBACK)
     return self._show(np.zeros(self.num_envs), 0)
 
   def step(self, actions: Any) -> ToyStep:
     actions = np.asarray(actions)
+    if self.length and self._num_steps == self.length:
+      return self.reset()
+    self._num_steps += 1
     spec = self.action_spec()
     assert actions.shape == (self.num_envs, *spec.shape)
     assert actions.dtype == spec.dtype
@@ -69,10 +82,13 @@ class Bandit:
       # A register is never read exactly.
       error = self._generator.uniform(-0.4, 0.4, self.num_envs)
       feedback = self._thing + error
+    if self.is_delayed:
+      feedback, self._waiting = self._waiting, feedback
     self.feedback.append(float(feedback.mean()))
     if self.drift:
       self._offset += self._generator.normal(0.0, self.drift, self.num_envs)
-    return self._show(feedback + self._offset, 1)
+    is_last = self.length and self._num_steps == self.length
+    return self._show(feedback + self._offset, 2 if is_last else 1)
 
   def _show(self, feedback: np.ndarray, step_type: int) -> ToyStep:
     self._thing = self._generator.integers(self.num_actions, size=len(feedback))

@@ -83,6 +83,14 @@ _WRONG_ADVICE = {
     'providers.0.query_delay=1 & learner={kind: value_advice, advice: reward}':
         'query_delay: 1 evaluates the query of the previous step, but the'
         ' learner value_advice expects the value',
+    'learner={kind: decoupled_approval, approval: reward, query_delay: 1}':
+        'query_delay: 0 evaluates the query of the current step, but the'
+        ' learner decoupled_approval expects the value of the previous one;'
+        ' allowed is the same query_delay in both',
+    'registers.other={kind: two_block, role: query, place: station_3, range:'
+    f' [0, 13], scale: 0.1}} & {_PAIRED}[query, other] & learner={{kind:'
+    ' decoupled_approval, approval: reward, query_delay: 1}':
+        'providers[0]: query_delay: 0 evaluates the query of the current step',
     'registers.query.role=meter':
         "value_advice reads the query from 'query', whose role is 'meter';"
         ' allowed is query',
