@@ -5,6 +5,7 @@ from realab_suite.feedback.providers.base import OWN
 from realab_suite.feedback.providers.base import PROVIDERS
 from realab_suite.feedback.providers.base import Observation
 from realab_suite.feedback.providers.base import Provider
+from realab_suite.feedback.providers.comparison import Comparison
 from realab_suite.feedback.providers.constant import Constant
 from realab_suite.feedback.providers.demonstration import Demonstration
 from realab_suite.feedback.providers.difference import Difference

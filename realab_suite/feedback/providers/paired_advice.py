@@ -27,10 +27,17 @@ class PairedAdvice(advice.Advice):
       of the second action, whose value is subtracted.
     value_function: See `Advice`.
     options: See `Advice`.
+    tolerance: If it is given, a critique is written instead: 1 if the first
+      action is better than the second, -1 if it is worse, and 0 if their values
+      differ by no more than this.
   """
 
   kind: Literal['paired_advice'] = 'paired_advice'
   reads: _Pair
+  # The digests of designs from before there were critiques stay the same.
+  tolerance: Annotated[float, pydantic.Field(ge=0, le=1e9)] | None = (
+      pydantic.Field(None, exclude_if=lambda tolerance: tolerance is None)
+  )
 
   def step(
       self,
@@ -45,4 +52,7 @@ class PairedAdvice(advice.Advice):
         queries.pick(values, queries.index(readings[name], values.shape[-1]))
         for name in self.reads
     )
-    return {self.writes[0]: first - second}, state
+    better = first - second
+    if self.tolerance is not None:
+      better = queries.sign(better, self.tolerance)
+    return {self.writes[0]: better}, state

@@ -118,9 +118,9 @@ class Person(base.Provider):
   ) -> tuple[base.Writes, Any]:
     count, inner = state
     count = np.where(episode_start, 1, count + 1)
-    place = (count - 1) % (2 * self.clip)
+    place, is_end = queries.place_of(count, self.clip)
     is_asked = (
-        place == 2 * self.clip - 1
+        is_end
         if self.asks == answer_sources.COMPARISON
         else np.ones(np.shape(count), bool)
     )

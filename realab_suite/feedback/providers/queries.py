@@ -1,4 +1,6 @@
-"""Helpers for queries: indices of actions from readings, and their values."""
+"""Helpers for questions: queried actions and their values, clips, signs."""
+
+from typing import Any
 
 import numpy as np
 
@@ -22,3 +24,18 @@ def pick(values: np.ndarray, action: np.ndarray) -> np.ndarray:
   """
   picked = np.take_along_axis(values, np.asarray(action)[..., np.newaxis], -1)
   return picked[..., 0]
+
+
+def place_of(step: Any, clip: int) -> tuple[np.ndarray, np.ndarray]:
+  """Returns the place of a step in a pair of clips, and whether it ends it.
+
+  Places count from 0, steps from 1; the first pair begins with the episode.
+  """
+  place = np.asarray((step - 1) % (2 * clip))
+  return place, np.asarray(place == 2 * clip - 1)
+
+
+def sign(difference: np.ndarray, tolerance: float) -> np.ndarray:
+  """Returns 1, -1, or 0 where a difference is within a tolerance, `(...)`."""
+  is_clear = np.abs(difference) > tolerance
+  return np.where(is_clear, np.sign(difference), 0.0)
