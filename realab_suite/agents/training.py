@@ -167,6 +167,18 @@ def advantages(
   return estimates
 
 
+def mean_and_deviation(moments: np.ndarray) -> tuple[float, float]:
+  """Returns mean and standard deviation, from number, sum and sum of squares.
+
+  Fewer than two numbers have the mean 0 and the deviation 1.
+  """
+  count, total, squares = moments
+  if count < 2:
+    return 0.0, 1.0
+  variance = squares / count - (total / count) ** 2
+  return float(total / count), float(np.sqrt(max(variance, 0.0)) + 1e-4)
+
+
 @final
 class FeedbackScale:
   """Running standard deviation of the discounted sum of feedback.
@@ -191,11 +203,7 @@ class FeedbackScale:
   @property
   def value(self) -> float:
     """Divisor of the feedback."""
-    count, total, squares = self._moments
-    if count < 2:
-      return 1.0
-    variance = squares / count - (total / count) ** 2
-    return float(np.sqrt(max(variance, 0.0)) + 1e-4)
+    return mean_and_deviation(self._moments)[1]
 
   def update(self, batch: dict[str, np.ndarray]) -> None:
     """Updates the scale with the transitions of a batch.

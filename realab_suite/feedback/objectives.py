@@ -77,30 +77,35 @@ class ObjectiveSpec(validation.Spec):
 
 
 _Options = Mapping[str, Any]
-OBJECTIVES: registry.Registry[Callable[[_Options], dict[str, Any]]] = (
+OBJECTIVES: registry.Registry[Callable[[_Options], dict[str, Any] | None]] = (
     registry.Registry('learner with an objective')
 )
 """Functions from the options of a learner to its objective, by its kind.
 
-A `KeyError` means that an option is missing.
+`None` means that these options make it maximise no function of readings. A
+`KeyError` means that an option is missing.
 """
 
 
 @OBJECTIVES.add('policy_gradient')
 @OBJECTIVES.add('q_learning')
-def _return(options: _Options) -> dict[str, Any]:
+def _return(options: _Options) -> dict[str, Any] | None:
   registers = {_name(options, 'reward'): 1.0}
   objective = {
       'kind': RETURN,
       'registers': registers,
       'discount': options.get('gamma', DEFAULT_DISCOUNT),
   }
-  defence = options.get('defence')
-  if isinstance(defence, Mapping) and defence.get('kind') == 'mona':
+  given = options.get('defence')
+  defence: _Options = given if isinstance(given, Mapping) else {}
+  if defence.get('kind') == 'mona':
     # Approval is paid beside the reward.
     if weight := defence.get('weight', 1.0):
       registers[_name(defence, 'approval')] = weight
     objective['queries'] = [_name(defence, 'query')]
+  if defence.get('source') == 'comparisons':
+    # They compare the agent with itself, so their sum is not what it earns.
+    return None
   return objective
 
 
@@ -173,6 +178,9 @@ def of_learner(learner: Any) -> tuple[ObjectiveSpec | None, str]:
       raise ValueError(
           f'learner.{error.args[0]}: required key is missing'
       ) from error
+    if declared is None:
+      reason = f'learner {learner.kind!r} learns a reward from comparisons'
+      return None, f'{reason}, whose sum says nothing'
   try:
     return ObjectiveSpec.model_validate(declared), ''
   except pydantic.ValidationError as error:

@@ -139,18 +139,27 @@ class Defence(validation.Model):
 DEFENCES: registry.Registry[type[Defence]] = registry.Registry('defence')
 
 
-def data_of(batch: Batch, setting: Setting) -> dict[str, jax.Array]:
+def data_of(
+    batch: Batch, setting: Setting, with_readings: bool = True
+) -> dict[str, jax.Array]:
   """Returns features of the observations and actions, `(time, worlds, ...)`.
 
   Args:
     batch: See `Defence.treat`.
     setting: What the defence knows of its learner.
+    with_readings: False to put 0 for each reading of a register.
 
   Returns:
     `vector` and images; actions are the last elements of `vector`, one-hot or
     as they are.
   """
-  encoded = dict(setting.encoder.encode(batch['observation']))
+  observation = dict(batch['observation'])
+  if not with_readings:
+    own = features.key_of(setting.options.reward, observation)
+    for name, value in observation.items():
+      if name == own or name.startswith('registers/'):
+        observation[name] = np.zeros_like(value)
+  encoded = dict(setting.encoder.encode(observation))
   action = jax.numpy.asarray(batch['choice']['action'])
   if setting.controls.num_actions is not None:
     action = jax.nn.one_hot(action, setting.controls.num_actions)
