@@ -70,7 +70,7 @@ _WRONG = {
         'demonstration uses action set dmlab_like v1; the design has None',
     'action_set={name: dmlab, version: 1}':
         "action_set: action set 'dmlab v1' is unknown; did you mean"
-        " 'dmlab_like v1'?; known are ['dmlab_like v1', 'walk v1']",
+        " 'dmlab_like v1'?; known are ['dmlab_like v1', ",
     'schedule={meter_substep: 5, provider_substep: 3}':
         'meter_substep 5 must not come after provider_substep 3',
 }  # fmt: skip
