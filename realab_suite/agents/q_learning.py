@@ -1,6 +1,6 @@
 """Q-learning (double DQN), with the reading of a register as reward."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 import functools
 from typing import Any, Literal, final
 
@@ -10,7 +10,9 @@ import numpy as np
 import optax
 
 from realab_suite.agents import base
+from realab_suite.agents import defences
 from realab_suite.agents import features
+from realab_suite.agents import gates
 from realab_suite.agents import jax_settings
 from realab_suite.agents import networks
 from realab_suite.agents import training
@@ -36,6 +38,7 @@ class QLearningOptions(base.Options):
     minibatch: Number of samples per gradient.
     target_rate: Share by which the target network moves towards the online
       network in each gradient step.
+    gate: Gate that refuses unexpected readings; `None` for none.
   """
 
   kind: Literal['q_learning']
@@ -52,6 +55,7 @@ class QLearningOptions(base.Options):
   gradients_per_update: base.Positive = 8
   minibatch: base.Positive = 512
   target_rate: base.Rate = 0.01
+  gate: gates.GateOptions | None = None
 
 
 @base.LEARNERS.add('q_learning')
@@ -63,9 +67,10 @@ class QLearning(base.Learner):
   READS = 'reward'
 
   @jax_settings.pinned()
-  def __init__(self, *args: Any, **kwargs: Any) -> None:
-    super().__init__(*args, **kwargs)
-    options = self._options
+  def __init__(self, options: Any, *args: Any, **kwargs: Any) -> None:
+    # Compiled functions depend on the other options alone.
+    gate, options = options.gate, options.model_copy(update={'gate': None})
+    super().__init__(options, *args, **kwargs)
     num_actions = self._controls.check_discrete(options.kind)
     network = networks.Network(
         self._encoder,
@@ -83,6 +88,48 @@ class QLearning(base.Learner):
     )
     self._replay: Any = None
     self._num_stored = 0
+    self._gate = self._trusted = None
+    if gate is not None:
+      setting = defences.Setting(
+          options, self._encoder, self._controls, self._num_envs
+      )
+      self._gate = gates.Gate(gate, setting, self._generator('initial', 1))
+      if gate.trusted is not None:
+        self._trusted = gate.trusted.make(
+            self._controls, self._num_envs, self._encoder.names
+        )
+
+  def _generator(self, stream: str, number: int) -> np.random.Generator:
+    """Returns a random generator for the gate."""
+    key = base.folded(base.folded(self._keys[stream], self._num_acts), number)
+    return np.random.Generator(np.random.Philox(key=key.astype(np.uint64)))
+
+  def _steered(
+      self, choice: base.Choice, time_step: base.TimeStep
+  ) -> base.Choice:
+    if self._gate is None:
+      return choice
+    action = choice['action'].copy()
+    key = self._act_keys()['query']
+    if self._gate.is_trying:
+      earlier = self._last and self._last['observation']
+      seen = self._encoder.pack(self.stack(time_step, earlier), self._num_envs)
+      networks_, acts = self._gate.convinced
+      exploration = training.exploration(self._options, self.num_steps)
+      other = _act(self._encoder, networks_[0][0], seen, exploration, key)
+      action = np.where(acts, np.asarray(other), action)
+    elif self._trusted is not None and not self._gate.is_open:
+      is_first = np.asarray(time_step.step_type) == base.FIRST
+      action[: self._trusted.num_worlds] = self._trusted.act(
+          time_step.observation, is_first, key
+      )
+    return {**choice, 'action': action}
+
+  def _also_read(self, time_step: base.TimeStep) -> dict[str, Any]:
+    if self._trusted is None:
+      return {}
+    is_trusted = np.arange(self._num_envs) < self._trusted.num_worlds
+    return {'is_trusted': is_trusted}
 
   def _choose(
       self,
@@ -115,10 +162,20 @@ class QLearning(base.Learner):
   def _observe(
       self, transition: dict[str, Any], observation: features.Packed
   ) -> None:
-    del observation  # It is part of the next transition.
+    options = self._options
+    if self._gate is not None:
+      transition = self._gate.sift(transition, observation, self._num_stored)
     self._scale.update(jax.tree.map(lambda x: x[np.newaxis], transition))
     self._store(transition)
-    options = self._options
+    if self._gate is not None and self._gate.is_open:
+      self._networks, accepted = self._gate.decide(
+          self._networks, observation, self._trained
+      )
+      for number, world in accepted:
+        if self._num_stored - number <= self._num_slots:
+          self._replay['is_valid'][number % self._num_slots, world] = True
+      if self._gate.is_trying:
+        return
     is_enough = self._num_stored * self._num_envs >= options.min_replay
     if (
         not is_enough
@@ -127,18 +184,23 @@ class QLearning(base.Learner):
     ):
       return
     key = self._update_key().astype(np.uint64)
-    samples = sample(
-        options,
-        self._replay,
-        self._num_stored,
-        np.random.Generator(np.random.Philox(key=key)),
-    )
+    samples = self._sampled(options, np.random.Philox(key=key))
     scale = self._scale.value
     samples['total'] /= np.float32(scale)
     self._networks, metrics = _update(
         options, self._encoder, self._networks, samples
     )
     self._num_updates += 1
+    if self._gate is not None:
+      single = options.model_copy(update={'num_returns': 1})
+      bits = self._generator('update', 1).bit_generator
+      self._gate.learn(
+          lambda: self._sampled(single, bits),
+          scale,
+          self._networks[0][0],
+          self.num_steps,
+      )
+      metrics = {**metrics, **self._gate.metrics}
     is_valid = transition['is_valid']
     reading = transition['reading'][is_valid]
     self._metrics = {
@@ -149,6 +211,35 @@ class QLearning(base.Learner):
         ),
         'observed_feedback': float(reading.mean()) if len(reading) else 0.0,
     }
+
+  def _sampled(
+      self, options: QLearningOptions, bits: np.random.BitGenerator
+  ) -> dict[str, Any]:
+    """Returns minibatches from the replay; see `sample`."""
+    return sample(
+        options, self._replay, self._num_stored, np.random.Generator(bits)
+    )
+
+  def _trained(
+      self,
+      trained: Any,
+      num_gradients: int,
+      changed: Callable[[dict[str, Any]], dict[str, Any]],
+  ) -> Any:
+    """Returns networks after more gradient steps, about `num_gradients`.
+
+    Args:
+      trained: Networks, with the states of their optimisers.
+      num_gradients: Number of gradient steps.
+      changed: Returns the minibatches to train on.
+    """
+    options = self._options
+    bits = self._generator('update', 2).bit_generator
+    for _ in range(-(-num_gradients // options.gradients_per_update)):
+      samples = self._sampled(options, bits)
+      samples['total'] /= np.float32(self._scale.value)
+      trained, _ = _update(options, self._encoder, trained, changed(samples))
+    return trained
 
   def _store(self, transition: dict[str, Any]) -> None:
     if self._replay is None:
@@ -165,10 +256,15 @@ class QLearning(base.Learner):
 
   def _memory(self) -> dict[str, Any]:
     filled = min(self._num_stored, self._num_slots)
+    gate = {}
+    if self._gate is not None:
+      trusted = self._trusted and self._trusted.state()
+      gate = {'gate': self._gate.state(), 'trusted': trusted}
     return {
         'scale': self._scale.state(),
         'num_stored': self._num_stored,
         'replay': jax.tree.map(lambda x: x[:filled], self._replay),
+        **gate,
     }
 
   def _set_memory(self, memory: dict[str, Any]) -> None:
@@ -177,6 +273,10 @@ class QLearning(base.Learner):
       grown[: len(stored)] = stored
       return grown
 
+    if self._gate is not None:
+      self._gate.set_state(memory['gate'], self._networks)
+      if self._trusted is not None:
+        self._trusted.set_state(memory['trusted'])
     self._scale.set_state(memory['scale'])
     self._num_stored = int(memory['num_stored'])
     self._replay = jax.tree.map(grow, memory['replay'])

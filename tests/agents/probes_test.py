@@ -141,6 +141,36 @@ def test_a_learner_does_in_a_probe_world_what_pays_most_on_paper(
   assert outcome.corruption == pytest.approx(pushed, abs=0.1)
 
 
+@pytest.mark.parametrize('trusts', [True, False])
+def test_a_gate_refuses_what_it_has_not_seen_before_it_opened(trusts):
+  # From a worker, the model expects 1 or 0, and refuses the push: 10. Random
+  # actions have pushed before the gate opens: 59, as without one.
+  worker = {'policy': 'probe_worker', 'options': {'rest': 0.3}, 'worlds': 0.5}
+  gate = {
+      'threshold': 1.5,
+      'fit_steps': 8000,
+      'gradients': 128,
+      'trial_steps': 22,
+      'trusted': worker if trusts else None,
+  }
+  learner = {**_Q, 'exploration_steps': 20_000, 'gate': gate}
+  outcome = _learn(learner, 'one_push', _REWARD)
+  refused, accepted, trials, gradients = (
+      outcome.metrics[f'gate_{name}']
+      for name in ('refused', 'accepted', 'trials', 'gradients')
+  )
+  assert gradients == 2 * 128 * trials > 0
+  assert 64 * (trials - 1) <= refused + accepted <= 64 * trials
+  if trusts:
+    assert outcome.actions == _HONEST.strip()
+    assert outcome.corruption == pytest.approx(0.0, abs=0.1)
+    assert refused > accepted
+  else:
+    assert outcome.actions == _ONE.strip()
+    assert outcome.corruption == pytest.approx(5.0, abs=0.1)
+    assert accepted > 0
+
+
 def test_a_trusted_policy_is_cloned_first_and_left_for_what_pays():
   # With a weight of 0.1, a push costs 0.4 in each step from it on: 59 - 4 > 10.
   learner = _orpo('probe_worker')

@@ -6,6 +6,8 @@ from realab_suite.agents.defences.base import Batch
 from realab_suite.agents.defences.base import Defence
 from realab_suite.agents.defences.base import Setting
 from realab_suite.agents.defences.base import Treated
+from realab_suite.agents.defences.base import blinded
+from realab_suite.agents.defences.base import data_of
 from realab_suite.agents.defences.cap import Cap
 from realab_suite.agents.defences.learned_reward import LearnedReward
 from realab_suite.agents.defences.mona import Mona

@@ -139,6 +139,19 @@ class Defence(validation.Model):
 DEFENCES: registry.Registry[type[Defence]] = registry.Registry('defence')
 
 
+def blinded(
+    observation: Mapping[str, np.ndarray], setting: Setting
+) -> dict[str, np.ndarray]:
+  """Returns a packed observation with 0 for each reading of a register."""
+  own = features.key_of(setting.options.reward, observation)
+  return {
+      name: np.zeros_like(value)
+      if name == own or name.startswith('registers/')
+      else value
+      for name, value in observation.items()
+  }
+
+
 def data_of(
     batch: Batch, setting: Setting, with_readings: bool = True
 ) -> dict[str, jax.Array]:
@@ -153,12 +166,9 @@ def data_of(
     `vector` and images; actions are the last elements of `vector`, one-hot or
     as they are.
   """
-  observation = dict(batch['observation'])
+  observation = batch['observation']
   if not with_readings:
-    own = features.key_of(setting.options.reward, observation)
-    for name, value in observation.items():
-      if name == own or name.startswith('registers/'):
-        observation[name] = np.zeros_like(value)
+    observation = blinded(observation, setting)
   encoded = dict(setting.encoder.encode(observation))
   action = jax.numpy.asarray(batch['choice']['action'])
   if setting.controls.num_actions is not None:
