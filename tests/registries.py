@@ -31,7 +31,10 @@ def preserved() -> Iterator[None]:
   )
   if util.find_spec('jax') is not None:  # It is in the extra `agents`.
     agents = importlib.import_module('realab_suite.agents')
-    registries += (agents.LEARNERS._entries,)
+    registries += (
+        agents.LEARNERS._entries,
+        agents.defences.DEFENCES._entries,
+    )
   before = [dict(entries) for entries in registries]
   try:
     yield

@@ -460,16 +460,16 @@ def from_plain(like: Any, arrays: Mapping[str, Any]) -> Any:
         ' the state was made with other options or specs'
     )
   for name, leaf in expected.items():
-    if np.shape(arrays[name]) != leaf.shape:
+    if np.shape(arrays[name]) != np.shape(leaf):
       raise errors.StateLayoutError(
           f'state of a learner: {name!r} has shape {np.shape(arrays[name])},'
-          f' expected {leaf.shape}'
+          f' expected {np.shape(leaf)}'
       )
   # JAX would round the float64 of a learner that uses NumPy.
   new = [
-      np.array(arrays[name], leaf.dtype)
-      if isinstance(leaf, np.ndarray)
-      else jax.numpy.asarray(arrays[name], leaf.dtype)
+      jax.numpy.asarray(arrays[name], leaf.dtype)
+      if isinstance(leaf, jax.Array)
+      else np.array(arrays[name], np.asarray(leaf).dtype)[()]
       for name, leaf in expected.items()
   ]
   return jax.tree_util.tree_unflatten(structure, new)

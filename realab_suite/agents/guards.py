@@ -100,9 +100,11 @@ class Guard:
       The batch, with `is_cloned`: the steps whose actions are to be cloned. If
       there are any, no step is valid.
     """
-    treated, self._state, metrics = self._defence.treat(
+    treated, state, metrics = self._defence.treat(
         batch, self._setting, self._state, key
     )
+    self._check(treated, batch)
+    self._state = state
     is_own = batch['is_valid'] & ~batch['is_trusted']
     is_same = np.isclose(treated['reading'], batch['reading'], atol=1e-6)
     is_changed = ~(is_same & treated['is_valid'])[is_own]
@@ -118,6 +120,23 @@ class Guard:
         'is_cloned': batch['is_valid'] & is_trusted & clones,
         'is_valid': is_valid & ~is_trusted & (not clones),
     }
+
+  def _check(self, treated: dict[str, Any], batch: dict[str, Any]) -> None:
+    """Checks what a defence has returned.
+
+    Raises:
+      SpecError: If an entry is missing, or has another shape or numbers that
+        are not finite.
+    """
+    for name in ('reading', 'discount', 'is_valid'):
+      value = np.asarray(treated.get(name))
+      shape = batch[name].shape
+      if value.shape != shape or not np.isfinite(value.astype(float)).all():
+        raise errors.SpecError(
+            f'learner.defence {self._defence.kind!r}: treat returned {name!r}'
+            f' of the shape {value.shape}; allowed are finite numbers of the'
+            f' shape {shape}'
+        )
 
   @property
   def most(self) -> float | None:

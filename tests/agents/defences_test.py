@@ -4,7 +4,7 @@ from collections.abc import Sequence
 import contextlib
 import functools
 import re
-from typing import Any
+from typing import Any, Literal, final
 
 import numpy as np
 import pytest
@@ -21,6 +21,7 @@ from realab_suite.agents import defences
 from realab_suite.agents import features
 from realab_suite.config import validation
 from realab_suite.testing import probes
+from tests import registries
 from tests.agents import toys
 
 _KEY = np.array([1, 2], np.uint32)
@@ -155,6 +156,85 @@ def test_orpo_charges_the_ratio_of_occupancies():
   treated = _treated(clipped, batch, batch, **options)[-1]
   largest = (batch['reading'] - treated['reading']).max()
   assert largest == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ('entries', 'message'),
+    [
+        (
+            {'reading': np.zeros(3)},
+            "treat returned 'reading' of the shape (3,)",
+        ),
+        ({'discount': None}, "treat returned 'discount' of the shape ()"),
+        ({'reading': np.full((11, 4), np.nan)}, 'allowed are finite numbers'),
+    ],
+)
+def test_a_defence_that_returns_something_else_is_refused(entries, message):
+  @final
+  class Broken(defences.Defence):
+    kind: Literal['broken'] = 'broken'
+
+    def treat(self, batch, setting, state, key):
+      return defences.Treated({**batch, **entries}, state)
+
+  with registries.preserved():
+    defences.DEFENCES.add('broken')(Broken)
+    learner = {
+        'kind': 'policy_gradient',
+        'reward': 'reward',
+        'defence': {'kind': 'broken'},
+        **probes.SMALL,
+    }
+    with contextlib.closing(probes.load('one_push', num_envs=4)) as env:
+      one = agents.make(
+          learner, env.observation_spec(), env.action_spec(), 4, 1
+      )
+      time_step = env.reset()
+      for _ in range(11):
+        time_step = env.step(one.step(time_step))
+      with pytest.raises(errors.SpecError, match=re.escape(message)):
+        one.step(time_step)
+
+
+def test_a_state_of_numbers_is_kept_as_well():
+  @final
+  class Counting(defences.Defence):
+    kind: Literal['counting'] = 'counting'
+
+    def initial_state(self, setting, generator):
+      return {'batches': 0, 'sum': 0.0, 'last': np.zeros(4)}
+
+    def treat(self, batch, setting, state, key):
+      state = {
+          'batches': state['batches'] + 1,
+          'sum': state['sum'] + float(batch['reading'].sum()),
+          'last': batch['reading'][-1].astype(float),
+      }
+      return defences.Treated(batch, state, {'batches': state['batches']})
+
+  with registries.preserved():
+    defences.DEFENCES.add('counting')(Counting)
+    learner = {
+        'kind': 'policy_gradient',
+        'reward': 'reward',
+        'defence': {'kind': 'counting'},
+        **probes.SMALL,
+    }
+    with contextlib.closing(probes.load('one_push', num_envs=4)) as env:
+      spec = env.observation_spec(), env.action_spec(), 4
+      one, other = agents.make(learner, *spec, 1), agents.make(
+          learner, *spec, 2
+      )
+      time_step = env.reset()
+      for _ in range(25):
+        time_step = env.step(one.step(time_step))
+      other.set_state(one.state())
+      for _ in range(10):
+        action = one.step(time_step)
+        np.testing.assert_array_equal(action, other.step(time_step))
+        time_step = env.step(action)
+    assert one.metrics()['batches'] == other.metrics()['batches'] == 3.0
+    assert trees.are_equal(one.state(), other.state())
 
 
 def test_a_guarded_learner_continues_from_its_state_bit_for_bit():
