@@ -14,6 +14,8 @@ from realab_suite.entities import appearance
 
 # Distance at which the feature of a ray has fallen to 1 / e, in metres.
 _RAY_SCALE = 2.0
+# Entry of the memory of a learner; see `Encoder.with_memory`.
+MEMORY = 'learner/memory'
 _DISTANCES, _CLASSES = 'ray_distances', 'ray_classes'
 
 Packed = dict[str, np.ndarray]
@@ -100,6 +102,15 @@ class Encoder:
           f' of the observation is an image: {sorted(observation_spec)}'
       )
     return encoder
+
+  def with_memory(self, units: int) -> 'Encoder':
+    """Returns an encoder whose last features are the memory of a learner.
+
+    Args:
+      units: Number of elements of the entry `MEMORY` of observations.
+    """
+    memory = _Entry(MEMORY, 'plain', (units,), 'float32')
+    return dataclasses.replace(self, entries=(*self.entries, memory))
 
   @property
   def image_shapes(self) -> dict[str, tuple[int, ...]]:

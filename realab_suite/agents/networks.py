@@ -1,8 +1,9 @@
 """Small networks for vectors and images, and distributions over actions."""
 
+from collections.abc import Callable
 import functools
 import math
-from typing import final
+from typing import Any, final
 
 import equinox as eqx
 import jax
@@ -234,6 +235,91 @@ class Gaussian(eqx.Module):
 
 
 @final
+class Memory(eqx.Module):
+  """Gated recurrent unit, whose state is the end of the vector of features.
+
+  Outputs are the same features with the state after the observation, so that
+  networks that follow see both. The arithmetic is that of `equinox.nn.GRUCell`.
+  """
+
+  inputs: Network
+  recurrent: Linear
+
+  def __init__(
+      self,
+      encoder: features.Encoder,
+      units: int,
+      generator: np.random.Generator,
+  ) -> None:
+    """Makes a unit.
+
+    Args:
+      encoder: Encoder of observations, without the state.
+      units: Number of elements of the state.
+      generator: Random generator of the initial weights.
+    """
+    self.inputs = Network(encoder, (), 3 * units, 1.0, generator)
+    self.recurrent = Linear(units, 3 * units, 1.0, generator)
+
+  def __call__(self, encoded: dict[str, jax.Array]) -> dict[str, jax.Array]:
+    """Returns features with the state after an observation.
+
+    Args:
+      encoded: Features with the state before it.
+    """
+    inputs, state = self._split(encoded)
+    return self._joined(encoded, self._next(inputs, state))
+
+  def through(
+      self, encoded: dict[str, jax.Array], continues: jax.Array
+  ) -> dict[str, jax.Array]:
+    """Returns features with the state after each observation of a sequence.
+
+    Args:
+      encoded: Features, each `(time, worlds, ...)`. Only the first states are
+        used.
+      continues: Whether the next observation belongs to the same episode,
+        `(time, worlds)`.
+    """
+    inputs, states = self._split(encoded)
+
+    def one_step(state: jax.Array, now: Any) -> tuple[jax.Array, jax.Array]:
+      inputs, continues = now
+      state = self._next(inputs, state)
+      return jnp.where(continues[..., jnp.newaxis], state, 0.0), state
+
+    _, states = jax.lax.scan(one_step, states[0], (inputs, continues))
+    return self._joined(encoded, states)
+
+  def state(self, encoded: dict[str, jax.Array]) -> jax.Array:
+    """Returns the state in a vector of features, `(..., units)`."""
+    return encoded['vector'][..., -self.recurrent.weight.shape[0] :]
+
+  def _split(
+      self, encoded: dict[str, jax.Array]
+  ) -> tuple[jax.Array, jax.Array]:
+    """Returns the inputs of the gates and the state."""
+    seen = encoded['vector'][..., : -self.recurrent.weight.shape[0]]
+    return self.inputs({**encoded, 'vector': seen}), self.state(encoded)
+
+  def _joined(
+      self, encoded: dict[str, jax.Array], state: jax.Array
+  ) -> dict[str, jax.Array]:
+    seen = encoded['vector'][..., : -state.shape[-1]]
+    return {**encoded, 'vector': jnp.concatenate([seen, state], axis=-1)}
+
+  def _next(self, inputs: jax.Array, state: jax.Array) -> jax.Array:
+    reset, keep, new = jnp.split(inputs, 3, axis=-1)
+    more_reset, more_keep, more_new = jnp.split(
+        self.recurrent(state), 3, axis=-1
+    )
+    reset = jax.nn.sigmoid(reset + more_reset)
+    keep = jax.nn.sigmoid(keep + more_keep)
+    new = jnp.tanh(new + reset * more_new)
+    return new + keep * (state - new)
+
+
+@final
 class Policy(eqx.Module):
   """Network from features to a distribution over actions."""
 
@@ -271,7 +357,7 @@ class Policy(eqx.Module):
 @functools.partial(jax.jit, static_argnums=(0, 4))
 def act(
     encoder: features.Encoder,
-    policy: Policy,
+    policy: Callable[..., Any],
     observation: features.Packed,
     key: jax.Array,
     greedy: bool,
@@ -280,7 +366,7 @@ def act(
 
   Args:
     encoder: Encoder of observations.
-    policy: The policy.
+    policy: Module from features to a distribution.
     observation: Packed observations.
     key: Random key.
     greedy: True to take the mode instead of drawing an action.
@@ -296,10 +382,12 @@ def act(
 
 @functools.partial(jax.jit, static_argnums=0)
 def probabilities(
-    encoder: features.Encoder, policy: Policy, observation: features.Packed
+    encoder: features.Encoder,
+    policy: Callable[..., Any],
+    observation: features.Packed,
 ) -> jax.Array:
   """Returns the probability of each discrete action, `(worlds, actions)`."""
-  return jax.nn.softmax(policy.network(encoder.encode(observation)))
+  return jax.nn.softmax(policy(encoder.encode(observation)).logits)
 
 
 def _orthogonal(

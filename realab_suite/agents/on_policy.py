@@ -53,12 +53,19 @@ class OnPolicyLearner(base.Learner):
         ),
     }
 
-  def _draw_minibatches(self) -> np.ndarray:
-    """Returns the sample indices of the next update's minibatches."""
-    num_samples = self._options.steps_per_update * self._num_envs
-    return training.draw_minibatches(
-        self._options, num_samples, self._update_key()
-    )
+  def _draw_minibatches(self, by_world: bool = False) -> np.ndarray:
+    """Returns the sample indices of the next update's minibatches.
+
+    Args:
+      by_world: True for indices of worlds instead.
+    """
+    options, num_samples = self._options, self._num_envs
+    if by_world:
+      size = max(1, options.minibatch // options.steps_per_update)
+      options = options.model_copy(update={'minibatch': size})
+    else:
+      num_samples *= options.steps_per_update
+    return training.draw_minibatches(options, num_samples, self._update_key())
 
   def _memory(self) -> dict[str, Any]:
     return {'transitions': self._transitions}

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pydantic
 
 from realab_suite.agents import base
 from realab_suite.agents import defences
@@ -31,6 +32,7 @@ class PolicyGradientOptions(on_policy.OnPolicyOptions):
     gae_lambda: Decay of generalised advantage estimates.
     entropy: Weight of the policy's entropy in the loss.
     clip: Largest change of a probability ratio in one update.
+    memory: Number of units of a recurrent memory before the networks, or 0.
     defence: What the learner does about corrupted rewards; `None` for nothing.
   """
 
@@ -40,6 +42,7 @@ class PolicyGradientOptions(on_policy.OnPolicyOptions):
   gae_lambda: base.Fraction = 0.95
   entropy: base.Weight = 0.01
   clip: base.Fraction = 0.2
+  memory: Annotated[int, pydantic.Field(ge=0, le=4096)] = 0
   defence: (
       Annotated[defences.Defence, option_types.ModelIn(defences.DEFENCES)]
       | None
@@ -48,10 +51,18 @@ class PolicyGradientOptions(on_policy.OnPolicyOptions):
 
 @final
 class ActorCritic(eqx.Module):
-  """A policy and its value function."""
+  """A policy and its value function, with a memory in common or without."""
 
   policy: networks.Policy
   value: networks.Network
+  memory: networks.Memory | None = None
+
+  def __call__(
+      self, encoded: dict[str, jax.Array]
+  ) -> networks.Categorical | networks.Gaussian:
+    if self.memory is not None:
+      encoded = self.memory(encoded)
+    return self.policy(encoded)
 
 
 @base.LEARNERS.add('policy_gradient')
@@ -63,14 +74,24 @@ class PolicyGradient(on_policy.OnPolicyLearner):
   READS = 'reward'
 
   @jax_settings.pinned()
-  def __init__(self, options: Any, *args: Any, **kwargs: Any) -> None:
+  def __init__(
+      self,
+      options: Any,
+      reading: str,
+      encoder: features.Encoder,
+      *args: Any,
+      **kwargs: Any,
+  ) -> None:
     # Compiled functions depend on the other options alone.
     plain = options.model_copy(update={'defence': None})
-    super().__init__(plain, *args, **kwargs)
+    self._seen = encoder
+    if options.memory:
+      encoder = encoder.with_memory(options.memory)
+    super().__init__(plain, reading, encoder, *args, **kwargs)
     self._guard: guards.Guard | None = None
     if options.defence is not None:
       setting = defences.Setting(
-          plain, self._encoder, self._controls, self._num_envs
+          plain, self._seen, self._controls, self._num_envs
       )
       key = base.folded(self._keys['initial'], 1).astype(np.uint64)
       generator = np.random.Generator(np.random.Philox(key=key))
@@ -88,6 +109,9 @@ class PolicyGradient(on_policy.OnPolicyLearner):
             generator,
         ),
         networks.Network(self._encoder, hidden, 1, 1.0, generator),
+        networks.Memory(self._seen, self._options.memory, generator)
+        if self._options.memory
+        else None,
     )
     return agent, training.optimizer(self._options).init(agent)
 
@@ -97,11 +121,30 @@ class PolicyGradient(on_policy.OnPolicyLearner):
       keys: Mapping[str, np.ndarray],
       greedy: bool,
   ) -> base.Choice:
-    policy = self._networks[0].policy
+    agent = self._networks[0]
     action, log_prob = networks.act(
-        self._encoder, policy, observation, keys['act'], greedy
+        self._encoder, agent, observation, keys['act'], greedy
     )
     return {'action': np.asarray(action), 'log_prob': np.asarray(log_prob)}
+
+  @jax_settings.pinned()
+  def stack(
+      self,
+      time_step: base.TimeStep,
+      earlier: Mapping[str, np.ndarray] | None,
+  ) -> Mapping[str, np.ndarray]:
+    stacked = super().stack(time_step, earlier)
+    if not self._options.memory:
+      return stacked
+    # The state before this observation, 0 where an episode begins.
+    is_first = np.asarray(time_step.step_type) == base.FIRST
+    state = np.zeros((len(is_first), self._options.memory), np.float32)
+    if earlier is not None:
+      packed = self._encoder.pack(earlier, len(is_first))
+      memory = self._networks[0].memory
+      known = np.asarray(_remember(self._encoder, memory, packed))
+      state = np.where(is_first[:, np.newaxis], state, known)
+    return {**stacked, features.MEMORY: state}
 
   @property
   def most(self) -> float | None:
@@ -121,14 +164,12 @@ class PolicyGradient(on_policy.OnPolicyLearner):
     return {} if self._guard is None else self._guard.queries(choice)
 
   def _probabilities(self, observation: features.Packed) -> Any:
-    return networks.probabilities(
-        self._encoder, self._networks[0].policy, observation
-    )
+    return networks.probabilities(self._encoder, self._networks[0], observation)
 
   def _learn(
       self, batch: dict[str, Any], observation: features.Packed
   ) -> dict[str, Any]:
-    metrics = {}
+    metrics, continues = {}, batch['is_valid']
     if self._guard is not None:
       key = base.folded(self._update_key(), 1)
       batch = self._guard.treat(batch, self.num_steps, key)
@@ -139,9 +180,9 @@ class PolicyGradient(on_policy.OnPolicyLearner):
         self._options,
         self._encoder,
         self._networks,
-        {**batch, 'reading': reading},
+        {**batch, 'reading': reading, 'continues': continues},
         observation,
-        self._draw_minibatches(),
+        self._draw_minibatches(by_world=self._options.memory > 0),
     )
     return {**metrics, **updated, 'feedback_scale': self._scale.value}
 
@@ -154,6 +195,16 @@ class PolicyGradient(on_policy.OnPolicyLearner):
       self._guard.set_state(memory['guard'])
     super()._set_memory(memory)
     self._scale.set_state(memory['scale'])
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _remember(
+    encoder: features.Encoder,
+    memory: networks.Memory,
+    observation: features.Packed,
+) -> jax.Array:
+  """Returns the state of a memory after an observation, `(worlds, units)`."""
+  return memory.state(memory(encoder.encode(observation)))
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
@@ -170,9 +221,13 @@ def _update(
   The observation after the batch bootstraps the values of its last steps.
   """
   agent, _ = trained
-  encoded = encoder.encode(batch['observation'])
-  values = agent.value(encoded)[..., 0]
-  last_value = agent.value(encoder.encode(observation))[..., 0]
+  seen = encoded = encoder.encode(batch['observation'])
+  last = encoder.encode(observation)
+  if agent.memory is not None:
+    seen = agent.memory.through(encoded, batch['continues'])
+    last = agent.memory(last)
+  values = agent.value(seen)[..., 0]
+  last_value = agent.value(last)[..., 0]
   next_values = jnp.concatenate([values[1:], last_value[jnp.newaxis]])
   advantage = training.advantages(
       batch, values, next_values, options.gamma, options.gae_lambda
@@ -184,6 +239,7 @@ def _update(
       'advantage': advantage,
       'target': values + advantage,
       'weight': batch['is_valid'].astype(jnp.float32),
+      'continues': batch['continues'],
   }
   if 'is_cloned' in batch:
     data['cloned'] = batch['is_cloned'].astype(jnp.float32)
@@ -193,21 +249,24 @@ def _update(
       trained,
       data,
       indices,
+      by_world=agent.memory is not None,
   )
 
 
 def _loss(
     options: PolicyGradientOptions, agent: ActorCritic, data: dict[str, Any]
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-  weight = data['weight']
-  distribution = agent.policy(data['encoded'])
+  weight, encoded = data['weight'], data['encoded']
+  if agent.memory is not None:
+    encoded = agent.memory.through(encoded, data['continues'])
+  distribution = agent.policy(encoded)
   log_prob = distribution.log_prob(data['action'])
   objective = training.clipped_objective(
       log_prob - data['log_prob'],
       training.standardize(data['advantage'], weight),
       options.clip,
   )
-  error = agent.value(data['encoded'])[..., 0] - data['target']
+  error = agent.value(encoded)[..., 0] - data['target']
   metrics = {
       'policy_loss': -training.mean(objective, weight),
       'value_loss': 0.5 * training.mean(error**2, weight),

@@ -79,7 +79,12 @@ def draw_minibatches(
 
 
 def run_epochs(
-    options: base.Options, loss: Loss, trained: Any, data: Any, indices: Any
+    options: base.Options,
+    loss: Loss,
+    trained: Any,
+    data: Any,
+    indices: Any,
+    by_world: bool = False,
 ) -> tuple[Any, dict[str, jax.Array]]:
   """Takes one gradient step for each minibatch.
 
@@ -89,14 +94,19 @@ def run_epochs(
     trained: A network and the optimiser's state.
     data: A pytree of arrays, each `(time, worlds, ...)`.
     indices: Sample indices from `draw_minibatches`, `(gradients, minibatch)`.
+    by_world: True if they are indices of worlds, of which minibatches contain
+      all steps: `(time, minibatch, ...)`.
 
   Returns:
     The new network and optimiser's state, and the means of the metrics.
   """
-  samples = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), data)
+  samples = data
+  if not by_world:
+    samples = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), data)
 
   def one_step(carry: Any, index: jax.Array) -> Any:
-    minibatch = jax.tree.map(lambda x: x[index], samples)
+    chosen = (slice(None), index) if by_world else index
+    minibatch = jax.tree.map(lambda x: x[chosen], samples)
     return descend(options, loss, carry, minibatch)
 
   trained, metrics = jax.lax.scan(one_step, trained, indices)
