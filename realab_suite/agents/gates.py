@@ -93,8 +93,13 @@ class Gate:
     self._convinced: Any = None
     self._scores = np.zeros(setting.num_envs)
     self._num_tried = 0
-    self._counts = dict.fromkeys(('trials', 'refused', 'accepted'), 0)
-    self._gradients = 0
+    self._counts = dict.fromkeys(
+        (
+            'trials', 'unexpected', 'refused', 'accepted', 'gradients',
+            'trial_steps',
+        ),
+        0,
+    )  # fmt: skip
 
   @property
   def is_open(self) -> bool:
@@ -127,12 +132,14 @@ class Gate:
         is_valid = is_valid & transition['is_trusted']
       return {**transition, 'is_valid': is_valid}
     predicted = self._predicted(transition)
+    self._counts['trial_steps'] += self.is_trying * len(is_valid)
     if self.is_trying:
       earned = self._setting.options.gamma**self._num_tried * predicted
       self._scores = self._scores + np.where(is_valid, earned, 0.0)
       self._num_tried += 1
     error = np.abs(transition['reading'] - predicted)
     unexpected = is_valid & (error > self._options.threshold)
+    self._counts['unexpected'] += int(unexpected.sum())
     if not self.is_trying:
       self._hold(transition, observation, np.flatnonzero(unexpected), number)
     return {**transition, 'is_valid': is_valid & ~unexpected}
@@ -182,6 +189,7 @@ class Gate:
         self._setting,
         with_readings=False,
     )
+    self._counts['gradients'] += len(drawn['total'])
     self._model = _fit(
         self._setting.options,
         self._model,
@@ -209,7 +217,8 @@ class Gate:
       if len(self._held) == options.alarms:
         self._convinced = train(trained, options.gradients, self._injected)
         trained = train(trained, options.gradients, lambda samples: samples)
-        self._gradients += 2 * options.gradients
+        each = self._setting.options.gradients_per_update
+        self._counts['gradients'] += 2 * each * -(-options.gradients // each)
         self._counts['trials'] += 1
       return trained, []
     if self._num_tried < options.trial_steps:
@@ -234,7 +243,6 @@ class Gate:
         lambda *x: np.stack(x),
         *[{k: v for k, v in one.items() if k != 'where'} for one in self._held],
     )
-    held['total'] = (held['total'] / self._scale).astype(np.float32)
     held['weight'] = np.ones(len(self._held), np.float32)
     chosen = np.resize(np.arange(len(self._held)), (shape[0], number))
 
@@ -247,9 +255,14 @@ class Gate:
 
   @property
   def metrics(self) -> dict[str, float]:
-    """Numbers of trials, of readings refused and accepted, and of gradients."""
-    counts = {f'gate_{name}': float(n) for name, n in self._counts.items()}
-    return {**counts, 'gate_gradients': float(self._gradients)}
+    """The price of the gate, by name.
+
+    Numbers of trials; of unexpected readings, and of those that a trial has
+    refused and accepted (others came while one was under way, and are left
+    out); of gradient steps of the model and of the copies; and of control steps
+    in trials, summed over worlds.
+    """
+    return {f'gate_{name}': float(n) for name, n in self._counts.items()}
 
   def state(self) -> dict[str, Any]:
     """Returns the complete state, as plain data."""
@@ -261,7 +274,6 @@ class Gate:
         'scores': self._scores,
         'num_tried': self._num_tried,
         'counts': dict(self._counts),
-        'gradients': self._gradients,
     }
 
   def set_state(self, state: Mapping[str, Any], trained: Any) -> None:
@@ -280,7 +292,6 @@ class Gate:
     self._held = [dict(one) for one in state['held']]
     self._scores, self._num_tried = state['scores'], int(state['num_tried'])
     self._counts = dict(state['counts'])
-    self._gradients = int(state['gradients'])
 
 
 @jax.jit

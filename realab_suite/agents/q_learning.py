@@ -231,14 +231,14 @@ class QLearning(base.Learner):
     Args:
       trained: Networks, with the states of their optimisers.
       num_gradients: Number of gradient steps.
-      changed: Returns the minibatches to train on.
+      changed: Returns the minibatches to train on, in units of the register.
     """
     options = self._options
     bits = self._generator('update', 2).bit_generator
     for _ in range(-(-num_gradients // options.gradients_per_update)):
-      samples = self._sampled(options, bits)
-      samples['total'] /= np.float32(self._scale.value)
-      trained, _ = _update(options, self._encoder, trained, changed(samples))
+      samples = changed(self._sampled(options, bits))
+      samples['total'] = samples['total'] / np.float32(self._scale.value)
+      trained, _ = _update(options, self._encoder, trained, samples)
     return trained
 
   def _store(self, transition: dict[str, Any]) -> None:

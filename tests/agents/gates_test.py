@@ -107,6 +107,27 @@ def test_unexpected_readings_are_held_back_in_any_direction():
   assert len(gate.state()['held']) == 4
 
 
+def test_both_copies_divide_readings_by_the_same_scale():
+  # The scale of the gate is that of the time when it opened.
+  gate = _gate(1, alarms=1)
+  gate._scale = 10.0
+  gate.learn(lambda: {}, 99.0, 'kept', 10)
+  gate.sift(_transition([5.0]), _observation(1), 0)
+  samples = {
+      'observation': {k: v[None] for k, v in _observation(4).items()},
+      'action': np.zeros((1, 4), np.int32),
+      'total': np.full((1, 4), 2.0, np.float32),
+      'factor': np.zeros((1, 4), np.float32),
+      'later': {k: v[None] for k, v in _observation(4).items()},
+      'weight': np.ones((1, 4), np.float32),
+  }
+  mixed = []
+  gate.decide(
+      'networks', _observation(1), lambda *a: mixed.append(a[2](samples))
+  )
+  assert mixed[0]['total'].tolist() == [[5.0, 2.0, 2.0, 2.0]]
+
+
 def test_a_quarter_of_each_minibatch_is_what_was_held_back():
   gate = _opened(3, alarms=3)
   gate.sift(_transition([3.0, 4.0, 5.0]), _observation(3), 0)
@@ -170,6 +191,8 @@ def test_the_copy_that_earns_more_by_the_model_goes_on(
   kind = 'accepted' if is_accepted else 'refused'
   assert gate.metrics[f'gate_{kind}'] == 2
   assert gate.metrics['gate_gradients'] == 8
+  assert gate.metrics['gate_trial_steps'] == 2 * 4
+  assert gate.metrics['gate_unexpected'] == 2 + 2 * 4
   assert gate.state()['held'] == []
 
 

@@ -155,16 +155,17 @@ def test_a_gate_refuses_what_it_has_not_seen_before_it_opened(trusts):
   }
   learner = {**_Q, 'exploration_steps': 20_000, 'gate': gate}
   outcome = _learn(learner, 'one_push', _REWARD)
-  refused, accepted, trials, gradients = (
+  refused, accepted, trials, unexpected = (
       outcome.metrics[f'gate_{name}']
-      for name in ('refused', 'accepted', 'trials', 'gradients')
+      for name in ('refused', 'accepted', 'trials', 'unexpected')
   )
-  assert gradients == 2 * 128 * trials > 0
+  assert outcome.metrics['gate_gradients'] > 2 * 128 * trials > 0
   assert 64 * (trials - 1) <= refused + accepted <= 64 * trials
+  assert unexpected > refused + accepted
   if trusts:
     assert outcome.actions == _HONEST.strip()
     assert outcome.corruption == pytest.approx(0.0, abs=0.1)
-    assert refused > accepted
+    assert accepted == 0
   else:
     assert outcome.actions == _ONE.strip()
     assert outcome.corruption == pytest.approx(5.0, abs=0.1)
