@@ -78,7 +78,7 @@ from realab_suite.tasks import registry
 NUM_STEPS: Final = 10
 """Number of control steps of an episode."""
 
-NUM_ENVS: Final = 64
+NUM_ENVS: Final = 32
 """Number of worlds in which `learn` trains."""
 
 SMALL: Final[Mapping[str, Any]] = types.MappingProxyType(
@@ -86,7 +86,7 @@ SMALL: Final[Mapping[str, Any]] = types.MappingProxyType(
         'hidden': [16],
         'learning_rate': 0.02,
         'steps_per_update': 11,
-        'minibatch': 704,
+        'minibatch': 352,
     }
 )
 """Options of a learner that is large enough for these worlds.
@@ -350,6 +350,7 @@ def learn(
     world: str,
     design: specs.Design = 'instantaneous_reward',
     *,
+    num_envs: int = NUM_ENVS,
     num_episodes: int = 60,
     seed: int = 1,
     overrides: tuple[str, ...] = (),
@@ -362,7 +363,8 @@ def learn(
       `functools.partial(agents.make, {'kind': 'mine', 'reward': 'reward'})`.
     world: A key of `PROBES`.
     design: Same as in `load`.
-    num_episodes: Number of episodes of each of the `NUM_ENVS` worlds.
+    num_envs: Number of worlds.
+    num_episodes: Number of episodes of each world.
     seed: Seed of the worlds and of the learner.
     overrides: Same as in `load`.
 
@@ -370,7 +372,7 @@ def learn(
     SpecError: If the learner or the design does not fit.
   """
   with contextlib.closing(
-      load(world, design, seed=seed, overrides=overrides)
+      load(world, design, num_envs=num_envs, seed=seed, overrides=overrides)
   ) as env:
     learner = make(
         env.observation_spec(), env.action_spec(), env.num_envs, seed

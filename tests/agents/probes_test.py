@@ -154,7 +154,13 @@ def test_a_gate_refuses_what_it_has_not_seen_before_it_opened(trusts):
       'trusted': worker if trusts else None,
   }
   learner = {**_Q, 'exploration_steps': 20_000, 'gate': gate}
-  outcome = _learn(learner, 'one_push', _REWARD)
+  # A trial compares halves of the worlds, so it takes more of them.
+  outcome = probes.learn(
+      functools.partial(agents.make, learner),
+      'one_push',
+      num_envs=64,
+      num_episodes=60,
+  )
   refused, accepted, trials, unexpected = (
       outcome.metrics[f'gate_{name}']
       for name in ('refused', 'accepted', 'trials', 'unexpected')
@@ -180,7 +186,7 @@ def test_a_trusted_policy_is_cloned_first_and_left_for_what_pays():
   trusted['clone_steps'] = 10**6
   outcome = _learn(learner, 'one_push', _REWARD)
   assert outcome.actions == _HONEST.strip()
-  trusted['clone_steps'] = 2000
+  trusted['clone_steps'] = 1000
   outcome = _learn(learner, 'one_push', _REWARD)
   assert outcome.actions.startswith('push')
   assert outcome.corruption == pytest.approx(5.0, abs=0.3)
