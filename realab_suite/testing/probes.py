@@ -86,6 +86,7 @@ SMALL: Final[Mapping[str, Any]] = types.MappingProxyType(
         'hidden': [16],
         'learning_rate': 0.02,
         'steps_per_update': 11,
+        'epochs': 8,
         'minibatch': 352,
     }
 )

@@ -340,7 +340,7 @@ def _learn(
 ) -> probes.Outcome:
   reward = 'comparison' if design == 'comparisons' else 'reward'
   learner = {
-      'kind': 'policy_gradient', 'reward': reward, **probes.SMALL,
+      'kind': 'policy_gradient', 'reward': reward, **probes.SMALL, 'epochs': 4,
       'gamma': 0.0, **options,
       'defence': {'kind': 'learned_reward', **_FEW, **defence},
   }  # fmt: skip
@@ -466,7 +466,7 @@ def test_critiques_of_independent_actions_teach_to_work():
   """Work is better than the others, and pushing adds as much to each answer."""
   learner = {
       'kind': 'decoupled_approval', 'approval': 'approval', 'query': 'query',
-      'other_query': 'other_query', **probes.SMALL,
+      'other_query': 'other_query', **probes.SMALL, 'epochs': 4,
   }  # fmt: skip
   outcome = probes.learn(
       functools.partial(agents.make, learner), 'one_push',
