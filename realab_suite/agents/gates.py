@@ -57,6 +57,15 @@ class GateOptions(validation.Model):
   injected: Annotated[float, pydantic.Field(gt=0, le=0.25)] = 0.25
   trial_steps: _Positive = 250
 
+  @pydantic.model_validator(mode='after')
+  def _without_cloning(self) -> 'GateOptions':
+    if self.trusted is not None and self.trusted.clone_steps:
+      raise ValueError(
+          f'trusted.clone_steps: {self.trusted.clone_steps}; allowed is 0,'
+          ' because a learner of values clones no policy'
+      )
+    return self
+
 
 @final
 class Gate:

@@ -96,7 +96,10 @@ class QLearning(base.Learner):
       self._gate = gates.Gate(gate, setting, self._generator('initial', 1))
       if gate.trusted is not None:
         self._trusted = gate.trusted.make(
-            self._controls, self._num_envs, self._encoder.names
+            self._controls,
+            self._num_envs,
+            self._encoder.names,
+            'learner.gate',
         )
 
   def _generator(self, stream: str, number: int) -> np.random.Generator:

@@ -45,6 +45,7 @@ class TrustedPolicy(validation.Model):
       controls: action_encoding.Controls,
       num_envs: int,
       observed: Collection[str],
+      owner: str = 'learner.defence',
   ) -> 'TrustedActor':
     """Returns the policy, ready to act.
 
@@ -52,13 +53,14 @@ class TrustedPolicy(validation.Model):
       controls: Encoder of the learner's actions.
       num_envs: Number of worlds of the learner.
       observed: Keys of observations.
+      owner: Location of the option that trusts it, for messages.
 
     Raises:
       SpecError: If the policy has other actions than the learner, reads other
         senses, or acts in all worlds.
     """
     policy = policies.make(self.policy, **self.options)
-    where = f'learner.defence.trusted.policy {self.policy!r}'
+    where = f'{owner}.trusted.policy {self.policy!r}'
     known = controls.action_set
     allowed = 'vectors' if known is None else known.key
     if known is not None:
@@ -74,7 +76,7 @@ class TrustedPolicy(validation.Model):
     number = int(np.ceil(self.worlds * num_envs))
     if number == num_envs:
       raise errors.SpecError(
-          f'learner.defence.trusted.worlds: {self.worlds:g}, all of {num_envs}'
+          f'{owner}.trusted.worlds: {self.worlds:g}, all of {num_envs}'
           ' worlds; allowed are smaller shares'
       )
     if self.random:

@@ -103,7 +103,8 @@ def _return(options: _Options) -> dict[str, Any] | None:
     if weight := defence.get('weight', 1.0):
       registers[_name(defence, 'approval')] = weight
     objective['queries'] = [_name(defence, 'query')]
-  if defence.get('source') == 'comparisons':
+  kind, source = defence.get('kind'), defence.get('source')
+  if kind == 'learned_reward' and source == 'comparisons':
     # They compare the agent with itself, so their sum is not what it earns.
     return None
   return objective

@@ -20,6 +20,7 @@ from realab_suite.agents import action_encoding
 from realab_suite.agents import defences
 from realab_suite.agents import features
 from realab_suite.config import validation
+from realab_suite.feedback import objectives
 from realab_suite.testing import probes
 from tests import registries
 from tests.agents import toys
@@ -266,6 +267,14 @@ def test_a_guarded_learner_continues_from_its_state_bit_for_bit():
   plain = agents.make({**learner, 'defence': None}, *spec, 1)
   with pytest.raises((errors.StateLayoutError, KeyError)):
     one.set_state(plain.state())
+
+
+def test_an_option_of_another_defence_does_not_remove_the_objective():
+  options = {'reward': 'reward', 'defence': {'kind': 'own'}}
+  for kind, is_judged in (('own', True), ('learned_reward', False)):
+    options['defence'] = {'kind': kind, 'source': 'comparisons'}
+    found = objectives.OBJECTIVES.get('policy_gradient')(options)
+    assert (found is not None) == is_judged
 
 
 def test_the_share_of_changed_steps_is_reported():

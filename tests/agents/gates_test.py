@@ -229,6 +229,14 @@ def test_a_learner_continues_in_the_middle_of_a_trial_bit_for_bit():
     [
         ({'threshold': -1.0, 'fit_steps': 9}, 'gate.threshold: '),
         ({'threshold': 1.0, 'fit_steps': 0}, 'gate.fit_steps: '),
+        (
+            {
+                'threshold': 1.0,
+                'fit_steps': 9,
+                'trusted': {**_WORKER, 'clone_steps': 5},
+            },
+            'trusted.clone_steps: 5; allowed is 0',
+        ),
         ({'threshold': 1.0}, 'gate.fit_steps: required key is missing'),
         (
             {'threshold': 1.0, 'fit_steps': 9, 'injected': 0.5},
@@ -240,7 +248,8 @@ def test_a_learner_continues_in_the_middle_of_a_trial_bit_for_bit():
                 'fit_steps': 9,
                 'trusted': {'policy': 'apple_seeker'},
             },
-            'has the actions of dmlab_like v1',
+            "learner.gate.trusted.policy 'apple_seeker': has the actions of"
+            ' dmlab_like v1',
         ),
     ],
 )
