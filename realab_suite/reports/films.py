@@ -33,12 +33,13 @@ WIDTHS = {'top_down': 480, 'first_person': 640}
 OnStep = Callable[[Any, tracking.Track], None]
 """Function that is called with the physics and the track at each step."""
 
-# Codec of each kind of file, and options of its container.
-_CODECS: dict[str, tuple[str, dict[str, str]]] = {
-    # With more threads, a few bytes differ from time to time.
-    '.mp4': ('libx264', {'x264-params': 'threads=1:lookahead-threads=1'}),
+# Codec of each kind of file, its options, and those of the container.
+_CODECS: dict[str, tuple[str, dict[str, str], dict[str, str]]] = {
+    # The same frames give the same bytes only with this option, on one machine
+    # as well.
+    '.mp4': ('libx264', {'x264-params': 'cpu-independent=1'}, {}),
     # Repeats without end.
-    '.webp': ('libwebp_anim', {'loop': '0'}),
+    '.webp': ('libwebp_anim', {}, {'loop': '0'}),
 }
 _BACKGROUND = (24, 28, 36)
 _PLAIN = (235, 238, 242)
@@ -81,7 +82,7 @@ def film(
         f'film {os.fspath(path)}: the name ends in {suffix!r}; allowed are'
         f' {list(_CODECS)}'
     )
-  codec, options = _CODECS[suffix]
+  codec, codec_options, options = _CODECS[suffix]
   try:
     # The video library would overwrite an existing file.
     open(path, 'x', encoding='utf-8').close()
@@ -107,6 +108,9 @@ def film(
     file.init_video_stream(
         codec, fps=1 / env.control_timestep(), pixel_format='yuv420p'
     )
+    # imageio passes options to containers only, where x264 never sees them.
+    stream: Any = file._video_stream
+    stream.options = codec_options
     stack.pop_all()
 
   def add(unused_physics: protocols.Physics, track: tracking.Track) -> None:
