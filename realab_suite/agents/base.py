@@ -26,6 +26,7 @@ Rate = Annotated[float, pydantic.Field(gt=0, le=1)]
 Weight = Annotated[float, pydantic.Field(ge=0, le=1000)]
 Choice = dict[str, np.ndarray]
 FIRST = int(dm_env.StepType.FIRST)
+LAST = int(dm_env.StepType.LAST)
 
 # Each stream has a key of its own, so that the draws of one reveal nothing
 # about the others.
@@ -157,7 +158,7 @@ class Learner(abc.ABC):
       transition = {
           **self._last,
           'reading': np.array(time_step.observation[self._reading], np.float32),
-          'discount': np.array(time_step.discount, np.float32),
+          'discount': self._discount(time_step).astype(np.float32),
           # The step that begins an episode ignores the action, so it is not an
           # outcome of the last choice.
           'is_valid': step_type != FIRST,
@@ -169,6 +170,10 @@ class Learner(abc.ABC):
     self._last = {'observation': observation, 'choice': choice}
     self._num_acts += 1
     return self._encode(choice)
+
+  def _discount(self, time_step: TimeStep) -> np.ndarray:
+    """Returns the weight of what follows a step, `(worlds,)`."""
+    return np.asarray(time_step.discount)
 
   def stack(
       self, time_step: TimeStep, earlier: Mapping[str, np.ndarray] | None

@@ -33,6 +33,9 @@ class PolicyGradientOptions(on_policy.OnPolicyOptions):
     entropy: Weight of the policy's entropy in the loss.
     clip: Largest change of a probability ratio in one update.
     memory: Number of units of a recurrent memory before the networks, or 0.
+    time_limit: What follows an episode that the time limit ends: `continues` if
+      it is worth what the last observation is, as in an episode without end, or
+      `ends` if it is worth nothing, as the evaluation counts it.
     defence: What the learner does about corrupted rewards; `None` for nothing.
   """
 
@@ -43,6 +46,7 @@ class PolicyGradientOptions(on_policy.OnPolicyOptions):
   entropy: base.Weight = 0.01
   clip: base.Fraction = 0.2
   memory: Annotated[int, pydantic.Field(ge=0, le=4096)] = 0
+  time_limit: Literal['continues', 'ends'] = 'continues'
   defence: (
       Annotated[defences.Defence, option_types.ModelIn(defences.DEFENCES)]
       | None
@@ -145,6 +149,12 @@ class PolicyGradient(on_policy.OnPolicyLearner):
       known = np.asarray(_remember(self._encoder, memory, packed))
       state = np.where(is_first[:, np.newaxis], state, known)
     return {**stacked, features.MEMORY: state}
+
+  def _discount(self, time_step: base.TimeStep) -> np.ndarray:
+    discount = super()._discount(time_step)
+    if self._options.time_limit == 'continues':
+      return discount
+    return np.where(np.asarray(time_step.step_type) == base.LAST, 0, discount)
 
   @property
   def most(self) -> float | None:

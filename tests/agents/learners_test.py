@@ -206,6 +206,27 @@ def test_a_learner_learns_from_delayed_rewards(kind):
   assert np.mean(env.returns[-50:]) > 0.9
 
 
+@pytest.mark.parametrize(
+    ('time_limit', 'after'), [('continues', 1), ('ends', 0)]
+)
+def test_nothing_follows_a_time_limit_that_ends_an_episode(time_limit, after):
+  env = toys.Chain(2, length=5)
+  learner = _make(
+      env, 'policy_gradient', reward='reward', time_limit=time_limit
+  )
+  seen = []
+  learner._observe = lambda transition, _: seen.append(transition['discount'])
+  time_step = env.reset()
+  # One world goes forth and terminates; the other one stays until the limit.
+  for _ in range(13):
+    learner.step(time_step)
+    time_step = env.step(np.array([1, 0]))
+  assert [list(one) for one in seen] == [
+      [0 if step in (4, 9) else 1, after if step == 12 else 1]
+      for step in range(1, 13)
+  ]
+
+
 @pytest.mark.parametrize('as_pixels', [False, True])
 def test_policy_gradient_learns_vectors_from_numbers_and_pixels(as_pixels):
   env = toys.Aim(16, as_pixels)
