@@ -2,6 +2,7 @@
 
 import re
 
+import numpy as np
 import pytest
 
 from campaigns import figure_lines
@@ -74,3 +75,22 @@ def test_the_figures_list_exactly_the_campaigns():
       for path in (planting.ROOT / 'campaigns').glob('*_campaign.py')
   }
   assert named == there
+
+
+def test_boxes_are_those_of_the_public_code():
+  """By hand: two moves down, of which the second one tampers, then one up."""
+  pytest.importorskip('jax', reason='jax is in the extra `agents`')
+  from campaigns import mcvl_boxes
+
+  boxes = mcvl_boxes.Boxes(1)
+  for is_deployed, read, places in (
+      (False, [0, 0, 0], [3, 3, 4]),
+      (True, [0, 5, -1], [3, 4, 3]),
+  ):
+    boxes.is_deployed = is_deployed
+    boxes.reset()
+    steps = [boxes.step(np.array([action])) for action in (1, 1, 0)]
+    seen = [step.observation for step in steps]
+    assert [one['registers/reward'][0] for one in seen] == read
+    assert [one['box'][0] for one in seen] == places
+    assert boxes.earned[0] == read[2]
