@@ -10,6 +10,7 @@ of the engine asks which kind a task is of.
 import abc
 from collections.abc import Callable, Collection, Mapping, Sequence
 import contextlib
+import functools
 import traceback
 from typing import Any, ClassVar, NamedTuple, NoReturn, Protocol, final
 
@@ -347,9 +348,13 @@ class WorldHost(Host):
     self._random_state: np.random.RandomState | None = None
     self._batch_shape = batch_shape
     self._unknown_reward = self._per_world(np.nan, np.float64)
-    self._expected = {
-        name: ((*batch_shape, *spec.shape), spec.dtype)
-        for name, spec in task.sense_spec.items()
+
+  @functools.cached_property
+  def _expected(self) -> dict[str, tuple[tuple[int, ...], np.dtype[Any]]]:
+    """Shape and type of each sense."""
+    return {
+        name: ((*self._batch_shape, *spec.shape), spec.dtype)
+        for name, spec in self._task.sense_spec.items()
     }
 
   @property

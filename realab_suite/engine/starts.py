@@ -70,7 +70,7 @@ class StartCheck:
     self._bodies = tuple(
         geom
         for geom in task.root_entity.mjcf_model.find_all('geom')
-        if physics.bind(geom).element_id in bodies
+        if bodies and physics.bind(geom).element_id in bodies
     )
     # Solid geoms of moving parts, with the mocap body and the way of each.
     own = solids.owners(physics, mechanism.registers)

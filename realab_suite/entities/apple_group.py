@@ -67,20 +67,14 @@ class Apples(measurables.MeasurableEntity):
     self._mjcf_root = mjcf.RootElement(model=name)
     self._eaten = state.Slot(self._mjcf_root, 'eaten', number)
     shape, self._radius = _SHAPES[kind]
-    self._parts = [
-        moving.MovingPart(
-            f'{name}_{i}',
-            [
-                {
-                    'type': shape,
-                    'size': [self._radius] * (3 if shape == 'box' else 1),
-                    **appearance.geom_style(kind),
-                }
-            ],
-            solid=False,
-        )
-        for i in range(number)
-    ]
+    self._number = number
+    self._geom = {
+        'type': shape,
+        'size': [self._radius] * (3 if shape == 'box' else 1),
+        'contype': 0,
+        'conaffinity': 0,
+        **appearance.geom_style(kind),
+    }
 
   @property
   def frames(self) -> tuple[mjcf.Element, ...]:
@@ -98,7 +92,7 @@ class Apples(measurables.MeasurableEntity):
   @property
   def number(self) -> int:
     """Number of apples."""
-    return len(self._parts)
+    return self._number
 
   @property
   def radius(self) -> float:
@@ -121,11 +115,21 @@ class Apples(measurables.MeasurableEntity):
     Args:
       root: Root entity of the task.
       position: `(x, y)`, in m.
+
+    Raises:
+      SpecError: If `root` has a parent.
     """
+    moving.check_root(root, self._mjcf_root.model)
     root.attach(self)
+    # One `MovingPart` per apple, with its own model, takes longer to load.
+    world, name = root.mjcf_model.worldbody, self._mjcf_root.model
+    position = (*position, self.radius)
     self._frames = tuple(
-        part.attach_to(root, (*position, self.radius)) for part in self._parts
+        world.add('body', name=f'{name}.{i}', mocap='true', pos=position)
+        for i in range(self._number)
     )
+    for frame in self._frames:
+      frame.add('geom', dclass=self._mjcf_root.default, **self._geom)
 
   def place(self, physics: protocols.Physics, positions: Any) -> None:
     """Moves the apples to new positions and marks them as uneaten.

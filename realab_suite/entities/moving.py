@@ -76,6 +76,24 @@ def move(
   physics.mark_as_dirty()
 
 
+def check_root(root: composer.Entity, name: str) -> None:
+  """Checks that mocap bodies can be added to an entity.
+
+  Args:
+    root: The entity.
+    name: Name of the part, for the message.
+
+  Raises:
+    SpecError: If `root` has a parent.
+  """
+  if root.parent is not None:
+    raise errors.SpecError(
+        f'{name}: a moving part can only be attached to the root entity of a'
+        f' task, and {root.mjcf_model.model!r} is attached to'
+        f' {root.parent.mjcf_model.model!r}'
+    )
+
+
 @final
 class MovingPart(modelled.ModelledEntity):
   """A mocap body with geoms."""
@@ -134,12 +152,7 @@ class MovingPart(modelled.ModelledEntity):
     Raises:
       SpecError: If `root` has a parent.
     """
-    if root.parent is not None:
-      raise errors.SpecError(
-          f'{self._mjcf_root.model}: a moving part can only be attached to the'
-          f' root entity of a task, and {root.mjcf_model.model!r} is attached'
-          f' to {root.parent.mjcf_model.model!r}'
-      )
+    check_root(root, self._mjcf_root.model)
     frame = root.attach(self)
     frame.pos = position
     frame.mocap = 'true'

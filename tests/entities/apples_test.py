@@ -82,3 +82,18 @@ def test_nothing_collides_with_an_apple(world):
   worlds.act(world.avatar, world.physics, 100, forward=1.0)
   assert world.avatar.position(world.physics)[0] > 2.3
   assert world.avatar.position(world.physics)[1] == pytest.approx(0, abs=1e-9)
+
+
+def test_groups_may_have_one_name_in_a_world_with_defaults():
+  arena = arenas.OpenRoom()
+  arena.mjcf_model.default.geom.margin = 0.5
+  groups = [apple_group.Apples(number=2), apple_group.Apples(number=3)]
+  for group in groups:
+    group.attach_to(arena)
+  physics = worlds.compile_world(arena)
+  for group in groups:
+    group.place(physics, np.ones((group.number, 2)))
+    geoms = [frame.geom[0] for frame in group.frames]
+    assert not physics.bind(geoms).margin.any()  # Not those of the room.
+  assert groups[0].eat(physics, np.ones(2), _REACH) == 2
+  assert [int(group.num_eaten(physics)) for group in groups] == [2, 0]

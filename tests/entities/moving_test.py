@@ -6,12 +6,15 @@ import pytest
 
 from realab_suite import errors
 from realab_suite.entities import appearance
+from realab_suite.entities import apple_group
 from realab_suite.entities import arenas
 from realab_suite.entities import avatars
+from realab_suite.entities import doors
 from realab_suite.entities import moving
 from tests import worlds
 
-_BOX = {'type': 'box', 'size': (0.2, 1.0, 0.5), **appearance.geom_style('door')}
+_STYLE = appearance.geom_style(doors.DOOR)
+_BOX = {'type': 'box', 'size': (0.2, 1.0, 0.5), **_STYLE}
 
 
 def _world(solid=True):
@@ -60,9 +63,11 @@ def test_a_part_moves_on_command_until_a_reset():
 def test_a_part_can_only_be_attached_to_the_root_of_a_task():
   arena, cart = composer.Arena('arena'), composer.Arena('cart')
   arena.attach(cart)
-  part = moving.MovingPart('part', [dict(_BOX)])
-  with pytest.raises(
-      errors.SpecError,
-      match=r"^part: .* task, and 'cart' is attached to 'arena'",
-  ):
-    part.attach_to(cart, (0.0, 0.0, 0.0))
+  for part in (
+      moving.MovingPart('part', [dict(_BOX)]), apple_group.Apples('part')
+  ):  # fmt: skip
+    with pytest.raises(
+        errors.SpecError,
+        match=r"^part: .* task, and 'cart' is attached to 'arena'",
+    ):
+      part.attach_to(cart, (0.0, 0.0, 0.0))
