@@ -58,7 +58,7 @@ def pytest_collection_finish(session: pytest.Session) -> None:
   del session
   gc.collect()
   gc.freeze()
-  gc.set_threshold(100_000, 20, 20)
+  gc.set_threshold(300_000, 20, 20)
 
 
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
