@@ -57,6 +57,7 @@ def _load(domain: str, seed: int, hiding: str) -> environment.Environment:
   # What reflects, and what casts shadows, would show more.
   model.mat_reflectance[:] = 0.5
   model.light_castshadow[:] = 1
+  model.vis.quality.shadowsize = 1024  # Many for pictures of 64 x 64 pixels.
   score = env.mechanism.registers['score']
   geoms = [env.physics.bind(block.geom).element_id for block in score.blocks]
   _HIDING[hiding](env, geoms)
