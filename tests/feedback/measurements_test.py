@@ -73,7 +73,7 @@ _KINDS: dict[str, tuple[Any, Any]] = {
     ),
     'distance to the nearest apple': (
         {'kind': 'distance', 'from': 'avatar', 'to': 'apples'},
-        lambda env: _nearest(env, _TORSO, [f'apples_{i}/' for i in range(8)]),
+        lambda env: _nearest(env, _TORSO, [f'apples.{i}' for i in range(8)]),
     ),
     'distance in space': (
         {'kind': 'distance', 'from': 'reward', 'to': 'avatar', 'axes': 'xyz'},
