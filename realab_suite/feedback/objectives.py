@@ -14,10 +14,14 @@ or in the design:
     learner:
       kind: my_learner
       objective: {kind: return, registers: {cost: -1.0}}
+
+A defence may pay a learner from other registers than its reward. Defences of
+this package declare that here, because evaluators do not need JAX; a class of
+another package declares it by `Defence.pays`.
 """
 
 from collections.abc import Callable, Mapping
-from typing import Annotated, Any, Final, Literal, final
+from typing import Annotated, Any, Final, Literal, NamedTuple, final
 
 import pydantic
 
@@ -77,37 +81,99 @@ class ObjectiveSpec(validation.Spec):
 
 
 _Options = Mapping[str, Any]
-OBJECTIVES: registry.Registry[Callable[[_Options], dict[str, Any] | None]] = (
+OBJECTIVES: registry.Registry[Callable[[_Options], dict[str, Any] | str]] = (
     registry.Registry('learner with an objective')
 )
 """Functions from the options of a learner to its objective, by its kind.
 
-`None` means that these options make it maximise no function of readings. A
-`KeyError` means that an option is missing.
+A string is the reason why these options make it maximise no function of
+readings. A `KeyError` means that an option is missing.
 """
+
+
+@final
+class Payment(NamedTuple):
+  """Readings that a learner with a defence is paid.
+
+  Attributes:
+    registers: Weight of each register in the sum.
+    queries: Same as in `ObjectiveSpec`.
+  """
+
+  registers: Mapping[str, float]
+  queries: tuple[str, ...] | None = None
+
+
+PAYMENTS: registry.Registry[Callable[[_Options, str], Payment | str]] = (
+    registry.Registry('defence of this package')
+)
+"""Functions from the options of a defence and the name of the reward, by kind.
+
+A string is the reason why there is no such sum.
+"""
+
+DEFENCES: registry.Registry[type[Any]] = registry.Registry('defence')
+"""Classes of defences, by kind; `agents.defences` fills it when imported."""
+
+
+@PAYMENTS.add('alarm')
+@PAYMENTS.add('cap')
+@PAYMENTS.add('orpo')
+def _reward_alone(options: _Options, reward: str) -> Payment:
+  del options
+  return Payment({reward: 1.0})
+
+
+@PAYMENTS.add('learned_reward')
+def _prediction(options: _Options, reward: str) -> Payment | str:
+  if options.get('source') == 'comparisons':
+    # They compare the agent with itself, so their sum is not what it earns.
+    return 'learns a reward from comparisons, whose sum says nothing'
+  return Payment({reward: 1.0})
+
+
+@PAYMENTS.add('mona')
+def _approval_beside(options: _Options, reward: str) -> Payment:
+  approval = _name(options, 'approval', 'defence.')
+  weights = {reward: 1.0, approval: options.get('weight', 1.0)}
+  return Payment(weights, (_name(options, 'query', 'defence.'),))
+
+
+def _payment(defence: Any, reward: str) -> Payment | str:
+  """Returns what a learner is paid, or the reason why nothing is known of it.
+
+  Args:
+    defence: Options of the defence, or `None`.
+    reward: Name of the register that the learner reads.
+  """
+  if not isinstance(defence, Mapping):
+    return Payment({reward: 1.0})
+  kind: Any = defence.get('kind')
+  if kind in PAYMENTS:
+    return PAYMENTS.get(kind)(defence, reward)
+  if kind not in DEFENCES:
+    return f'has the defence {messages.quote(kind)}, which is not registered'
+  one = validation.validate(DEFENCES.get(kind), defence, 'learner.defence')
+  if (weights := one.pays(reward)) is None:
+    return (
+        f'has the defence {kind!r}, which declares no sum of readings that it'
+        ' pays (`pays` in docs/defences.md)'
+    )
+  return Payment(weights, tuple(one.queries) or None)
 
 
 @OBJECTIVES.add('policy_gradient')
 @OBJECTIVES.add('q_learning')
-def _return(options: _Options) -> dict[str, Any] | None:
-  registers = {_name(options, 'reward'): 1.0}
-  objective = {
+def _return(options: _Options) -> dict[str, Any] | str:
+  payment = _payment(options.get('defence'), _name(options, 'reward'))
+  if isinstance(payment, str):
+    return payment
+  return {
       'kind': RETURN,
-      'registers': registers,
+      'registers': {name: w for name, w in payment.registers.items() if w},
       'discount': options.get('gamma', DEFAULT_DISCOUNT),
+      'queries': payment.queries,
   }
-  given = options.get('defence')
-  defence: _Options = given if isinstance(given, Mapping) else {}
-  if defence.get('kind') == 'mona':
-    # Approval is paid beside the reward.
-    if weight := defence.get('weight', 1.0):
-      registers[_name(defence, 'approval')] = weight
-    objective['queries'] = [_name(defence, 'query')]
-  kind, source = defence.get('kind'), defence.get('source')
-  if kind == 'learned_reward' and source == 'comparisons':
-    # They compare the agent with itself, so their sum is not what it earns.
-    return None
-  return objective
 
 
 @OBJECTIVES.add('value_advice')
@@ -134,12 +200,24 @@ def _imitation(options: _Options) -> dict[str, Any]:
   return {'kind': AGREEMENT, 'registers': registers}
 
 
-def _name(options: _Options, option: str) -> str:
-  """Returns the name of a register in an option of a learner."""
+def _name(options: _Options, option: str, owner: str = '') -> str:
+  """Returns the name of a register in an option of a learner.
+
+  Args:
+    options: Options of the learner, or of its defence.
+    option: The option.
+    owner: Path of the options in those of the learner, with a dot.
+
+  Raises:
+    KeyError: If the option is missing.
+    ValueError: If it is no name.
+  """
+  if option not in options:
+    raise KeyError(f'{owner}{option}')
   name = options[option]
   if not isinstance(name, str):
     raise ValueError(
-        f'learner.{option}: must be the name of a register, got'
+        f'learner.{owner}{option}: must be the name of a register, got'
         f' {messages.quote(name)}'
     )
   return name
@@ -179,9 +257,8 @@ def of_learner(learner: Any) -> tuple[ObjectiveSpec | None, str]:
       raise ValueError(
           f'learner.{error.args[0]}: required key is missing'
       ) from error
-    if declared is None:
-      reason = f'learner {learner.kind!r} learns a reward from comparisons'
-      return None, f'{reason}, whose sum says nothing'
+    if isinstance(declared, str):
+      return None, f'learner {learner.kind!r} {declared}'
   try:
     return ObjectiveSpec.model_validate(declared), ''
   except pydantic.ValidationError as error:

@@ -21,6 +21,7 @@ from realab_suite.agents import defences
 from realab_suite.agents import features
 from realab_suite.config import validation
 from realab_suite.feedback import objectives
+from realab_suite.feedback import specs
 from realab_suite.testing import probes
 from tests import registries
 from tests.agents import toys
@@ -270,11 +271,22 @@ def test_a_guarded_learner_continues_from_its_state_bit_for_bit():
 
 
 def test_an_option_of_another_defence_does_not_remove_the_objective():
-  options = {'reward': 'reward', 'defence': {'kind': 'own'}}
-  for kind, is_judged in (('own', True), ('learned_reward', False)):
-    options['defence'] = {'kind': kind, 'source': 'comparisons'}
-    found = objectives.OBJECTIVES.get('policy_gradient')(options)
-    assert (found is not None) == is_judged
+  @final
+  class Own(defences.Defence):
+    kind: Literal['own']
+    source: str
+
+    def treat(self, batch, setting, state, key):
+      return defences.Treated(batch, state)
+
+  with registries.preserved():
+    defences.DEFENCES.add('own')(Own)
+    for kind, is_judged in (('own', True), ('learned_reward', False)):
+      defence = {'kind': kind, 'source': 'comparisons'}
+      learner = {'reward': 'reward', 'defence': defence}
+      spec = specs.LearnerSpec(kind='policy_gradient', **learner)
+      found, _ = objectives.of_learner(spec)
+      assert (found is not None) == is_judged
 
 
 def test_the_share_of_changed_steps_is_reported():

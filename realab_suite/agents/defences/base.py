@@ -23,6 +23,7 @@ from realab_suite.agents import features
 from realab_suite.agents import trusted_policies
 from realab_suite.config import registry
 from realab_suite.config import validation
+from realab_suite.feedback import objectives
 
 Batch = dict[str, Any]
 
@@ -76,6 +77,25 @@ class Defence(validation.Model):
   def reads(self) -> tuple[str, ...]:
     """Names of further registers whose readings it uses."""
     return ()
+
+  def pays(self, reward: str) -> Mapping[str, float] | None:
+    """Returns the weight of each register in the sum that the learner is paid.
+
+    It is part of the learner's objective: evaluators add up these readings as
+    they are, so that tampering with any of them is seen.
+
+    Args:
+      reward: Name of the register that the learner reads as its reward.
+
+    Returns:
+      Weights by name; `None` if no sum of readings is paid, and nothing can be
+      said about tampering. The default is the reward alone, or `None` for a
+      defence that reads further registers, because it may pay from them.
+    """
+    if self.kind in objectives.PAYMENTS:
+      paid = objectives.PAYMENTS.get(self.kind)(self.model_dump(), reward)
+      return None if isinstance(paid, str) else paid.registers
+    return None if self.reads else {reward: 1.0}
 
   @property
   def queries(self) -> tuple[str, ...]:
@@ -136,7 +156,7 @@ class Defence(validation.Model):
     """
 
 
-DEFENCES: registry.Registry[type[Defence]] = registry.Registry('defence')
+DEFENCES: registry.Registry[type[Defence]] = objectives.DEFENCES
 
 
 def blinded(
