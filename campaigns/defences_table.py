@@ -1,147 +1,301 @@
-"""Sets defences beside each other, from the table of a report.
+"""Sets defences beside each other, from the folders of sweeps.
 
-Run from the root of the repository, with the folder of a report on the
-experiment `defences`, the folder of the sweep, and a picture to draw:
+Run from the root of the repository, with a picture to draw and the folders of
+sweeps of reward learning with and without defences, such as `defences`:
 
-    python -m campaigns.defences_table results/defences/report \
-      results/defences docs/images/defences.png
+    python -m campaigns.defences_table docs/images/defences.png results/defences
 
-It prints a table. The *tax* is what the secure twin of a defence earns less
-than that of reward learning, as a share. *False alarms* are the steps of that
-twin's last tenth of training whose reward the defence changes, although there
-is nothing to defend against.
+It prints a line for each run, and the best and the worst world of a defence
+that ran in several. Runs are compared with reward learning without a defence,
+in the same sweep and world, with the registers of both at the same places:
+
+- The *tax* is what the secure twin earns less than that of reward learning.
+- *False alarms* are the steps of the twin's last tenth of training that the
+  defence changes, although there is nothing to defend against; '-' where it
+  does not change suspicious steps alone.
+- *Training time* is a multiple of that of reward learning; *own gradient steps*
+  are those of the defence's own networks, and *inspections* the mean of an
+  episode.
 """
 
-from collections.abc import Mapping
-import csv
-import json
+from collections.abc import Sequence
 import pathlib
 import sys
+from typing import Any, NamedTuple, final
 
 import matplotlib
 from matplotlib import figure
 import numpy as np
 
+from realab_suite.agents import defences
+from realab_suite.config import validation
+from realab_suite.evaluation import intervals
+from realab_suite.experiments import result_tables
 from realab_suite.experiments import tables
-from realab_suite.experiments import training
+from realab_suite.feedback import providers
 from realab_suite.reports import charts
+from realab_suite.reports import numbers
+from realab_suite.reports import report_tables
+from realab_suite.reports import sweep_results
 
-_PLAIN = 'reward'
-# Worlds, as the ends of the names of runs; the first one has none.
-_WORLDS = {
-    '': 'unlock_door.near',
-    '_standard': 'unlock_door.standard',
-    '_impossible': 'unlock_door.impossible',
-    '_apples': 'collect_apples.standard',
-    '_meter': 'unlock_door.near, meter only',
-}
 _HEADER = (
-    'world', 'design', 'true return', 'hack rate (%)', 'label',
-    'corruption (m)', "twin's true return", 'tax (%)', 'false alarms (%)',
+    'world', 'run', 'true return', 'hack rate (%)', 'label', 'corruption (m)',
+    "twin's true return", 'tax (%)', 'false alarms (%)', 'training time',
+    'own gradient steps', 'inspections',
 )  # fmt: skip
-
-Row = Mapping[str, str]
-
-
-def _number(row: Row, column: str, factor: float = 1.0) -> str:
-  """Returns a figure of a row with its interval."""
-  if not row[column]:
-    return '-'
-  value, *ends = (
-      float(row[f'{column}{end}']) * factor if row[f'{column}{end}'] else None
-      for end in ('', '_low', '_high')
-  )
-  text = tables.text(value)
-  if None in ends or ends[0] == ends[1]:
-    return text
-  return f'{text} [{tables.text(ends[0])}, {tables.text(ends[1])}]'
+_WORLDS = ('design', 'defence', 'lowest hack rate (%)', 'highest hack rate (%)')
 
 
-def _false_alarms(sweep: pathlib.Path, run: str) -> str:
-  """Returns the share of changed steps at the end of training, in percent."""
-  shares = []
-  for path in sorted(sweep.glob(f'{run}.secure-*/{training.CURVE}')):
-    points = [json.loads(line) for line in path.read_text().splitlines()]
-    last = points[-max(1, len(points) // 10) :]
-    shares += [p['learner'].get('changed', 0.0) for p in last]
-  return tables.text(100 * float(np.mean(shares))) if shares else '-'
+@final
+class Entry(NamedTuple):
+  """A run, its secure twin, and reward learning in the same world.
 
-
-def lines(rows: Mapping[str, Row], sweep: pathlib.Path) -> list[list[str]]:
-  """Returns the lines of the table, by world.
-
-  Args:
-    rows: Rows of `tables.csv`, by the name of the run.
-    sweep: Folder of the sweep.
+  Attributes:
+    world: Name of the world; with that of `plain` if others differ from it.
+    own: Figures of the run.
+    twin: Figures of its twin, or `None`.
+    plain: Figures of reward learning; `None` for itself, and without it.
+    plain_twin: Figures of the twin of reward learning, or `None`.
   """
-  found = []
-  for end, world in _WORLDS.items():
-    others = [other for other in _WORLDS if other]
-    runs = [
-        run
-        for run in rows
-        if '.' not in run
-        and (run.endswith(end) if end else not run.endswith(tuple(others)))
+
+  world: str
+  own: numbers.Figures
+  twin: numbers.Figures | None
+  plain: numbers.Figures | None
+  plain_twin: numbers.Figures | None
+
+
+def _learner(run: sweep_results.Run) -> dict[str, Any]:
+  return dict(getattr(run.design.learner, 'model_extra', None) or {})
+
+
+def _defence(run: sweep_results.Run) -> defences.Defence | None:
+  """Returns the defence of a run, or `None` without a known one."""
+  given = _learner(run).get('defence') or {}
+  kind: Any = given.get('kind')
+  if kind not in defences.DEFENCES:
+    return None
+  return validation.validate(defences.DEFENCES.get(kind), given, run.name)
+
+
+def _is_plain(run: sweep_results.Run) -> bool:
+  options = _learner(run)
+  return 'reward' in options and not (
+      options.get('defence') or options.get('gate')
+  )
+
+
+def _common(one: sweep_results.Run, other: sweep_results.Run) -> int:
+  """Returns the number of registers at the same place, 0 if others differ."""
+  found, others = one.design.registers, other.design.registers
+  names = found.keys() & others.keys()
+  are_equal = one.world == other.world and all(
+      (found[name].place, found[name].channel)
+      == (others[name].place, others[name].channel)
+      for name in names
+  )
+  return are_equal * len(names)
+
+
+def entries(folder: pathlib.Path) -> list[Entry]:
+  """Returns an entry for each finished run of a learner in a sweep."""
+  sweep = sweep_results.load(folder)
+  figures = numbers.compute(sweep)
+  runs = [run for run in sweep.learned() if run.name in figures]
+
+  def twin(run: sweep_results.Run | None) -> numbers.Figures | None:
+    found = run and sweep.twin(run)
+    return figures.get(found.name) if found else None
+
+  beside: dict[str, sweep_results.Run | None] = {}
+  for run in runs:
+    same = [
+        (_common(run, one), -i)
+        for i, one in enumerate(runs)
+        if _is_plain(one) and _common(run, one)
     ]
-    plain = rows.get(f'{_PLAIN}{end}.secure')
-    for run in runs:
-      row, twin = rows[run], rows.get(f'{run}.secure')
-      tax = '-'
-      if twin and plain and run != f'{_PLAIN}{end}':
-        best = float(plain['true_return'])
-        if best > 0:
-          tax = tables.text(100 * (1 - float(twin['true_return']) / best))
-      found.append(
-          [
-              world,
-              f'`{run.removesuffix(end)}`',
-              _number(row, 'true_return'),
-              _number(row, 'hack_rate', 100),
-              row['label'] or row['verdict'],
-              _number(row, 'corruption_metres'),
-              _number(twin, 'true_return') if twin else '-',
-              tax,
-              _false_alarms(sweep, run),
-          ]
-      )
+    beside[run.name] = runs[-max(same)[1]] if same else None
+  found = []
+  for run in runs:
+    plain, world = beside[run.name], run.config['task']
+    others = {
+        one.name for one in beside.values() if one and one.world == run.world
+    }
+    if plain is not None and len(others) > 1:
+      world = f'{world}, as {plain.name}'
+    other = None if plain is run else plain
+    found.append(
+        Entry(
+            world,
+            figures[run.name],
+            twin(run),
+            figures[other.name] if other else None,
+            twin(other),
+        )
+    )
   return found
 
 
-def draw(rows: Mapping[str, Row]) -> figure.Figure:
-  """Draws the hack rate of each defence beside what its twin earns."""
-  canvas = figure.Figure(figsize=(6.4, 4.2), layout='constrained')
-  axes = canvas.subplots()
-  others = tuple(end for end in _WORLDS if end)
-  for i, (run, row) in enumerate(
-      (run, row)
-      for run, row in rows.items()
-      if '.' not in run and not run.endswith(others)
-  ):
-    twin = rows.get(f'{run}.secure')
-    if twin is None or not row['hack_rate']:
-      continue
-    x, y = float(twin['true_return']), 100 * float(row['hack_rate'])
-    spread = [
-        [[abs(float(one[f'{column}{end}'] or one[column]) * k - middle)]
-         for end in ('_low', '_high')]
-        for one, column, k, middle in (
-            (twin, 'true_return', 1, x), (row, 'hack_rate', 100, y),
-        )
-    ]  # fmt: skip
-    axes.errorbar(x, y, spread[1], spread[0], f'C{i}o', capsize=2, label=run)
-  axes.set_xlabel('true return of the secure twin (of 18)')
-  axes.set_ylabel('hack rate (%)')
-  axes.legend()
+def _tax(one: Entry) -> float | None:
+  if one.twin is None or one.plain_twin is None:
+    return None
+  most = one.plain_twin.summary.true_return.estimate
+  earned = one.twin.summary.true_return.estimate
+  return 100.0 * (1.0 - earned / most) if most > 0 else None
+
+
+def _false_alarms(one: Entry) -> float | None:
+  """Returns the share of changed steps at the end of training, in percent."""
+  defence = _defence(one.own.run)
+  if one.twin is None or defence is None or not defence.ALARMS:
+    return None
+  shares = [
+      point['learner']['changed']
+      for points in one.twin.run.curves.values()
+      for point in points[-max(1, len(points) // 10) :]
+      if 'changed' in point['learner']
+  ]
+  return 100.0 * float(np.mean(shares)) if shares else None
+
+
+def _seconds(one: numbers.Figures) -> float | None:
+  """Returns the mean time of training, in s."""
+  sums = [
+      sum(line['seconds'] for line in lines)
+      for lines in one.run.timing.values()
+  ]
+  return float(np.mean(sums)) if sums else None
+
+
+def _gradients(one: Entry) -> float | None:
+  """Returns the number of gradient steps that a learner alone does not take."""
+  found: list[float] = []
+  for points in one.own.run.curves.values():
+    last = points[-1]['learner']
+    if 'gate_gradients' in last:
+      found.append(last['gate_gradients'])
+    elif each := getattr(_defence(one.own.run), 'gradients', None):
+      found.append(each * last.get('num_updates', np.nan))
+  return float(np.mean(found)) if found else None
+
+
+def _inspections(one: Entry) -> float | None:
+  """Returns the mean number of inspections of an episode."""
+  budgets = [
+      provider.writes[-1]
+      for provider in one.own.run.design.providers
+      if isinstance(provider, providers.Inspection)
+  ]
+  if not budgets:
+    return None
+  # The first write is that of the reset.
+  return float(
+      np.mean(
+          [
+              sum(row.registers[name].num_writes - 1 for name in budgets)
+              for row in one.own.run.rows
+              if row.counts
+          ]
+      )
+  )
+
+
+def _line(one: Entry) -> list[tables.Figure]:
+  spent, others = _seconds(one.own), one.plain and _seconds(one.plain)
+  return [
+      one.world,
+      f'`{one.own.run.name}`',
+      result_tables.return_text(one.own.summary),
+      _rate(one),
+      report_tables.labels_text(one.own),
+      one.own.summary.corruption,
+      one.twin and result_tables.return_text(one.twin.summary),
+      _tax(one),
+      _false_alarms(one),
+      spent / others if spent and others else None,
+      _gradients(one),
+      _inspections(one),
+  ]
+
+
+def _rate(one: Entry) -> tables.Figure:
+  return result_tables.hacking_figures(one.own.hacking)[0]
+
+
+def lines(found: Sequence[Entry]) -> list[list[tables.Figure]]:
+  """Returns the header and the lines of the table, by world."""
+  ordered = sorted(found, key=lambda one: one.world)
+  return [list(_HEADER), *map(_line, ordered)]
+
+
+def worlds(found: Sequence[Entry]) -> list[list[tables.Figure]]:
+  """Returns the best and the worst world of each defence, with a header."""
+  rows: dict[tuple[str, str], list[Entry]] = {}
+  for one in found:
+    given = _learner(one.own.run).get('defence') or {}
+    kind = str(given.get('kind', tables.NOTHING))
+    rows.setdefault((one.own.run.design.name, kind), []).append(one)
+  table: list[list[tables.Figure]] = [list(_WORLDS)]
+  for names, of_defence in rows.items():
+    judged = [
+        (one.own.hacking.rate.estimate, one)
+        for one in of_defence
+        if one.own.hacking is not None
+    ]
+    if len({one.world for _, one in judged}) > 1:
+      judged.sort(key=lambda pair: pair[0])
+      ends = (judged[0][1], judged[-1][1])
+      cells = (f'{tables.text(_rate(one))} ({one.world})' for one in ends)
+      table.append([*names, *cells])
+  return table
+
+
+def draw(found: Sequence[Entry]) -> figure.Figure:
+  """Draws hack rates and true returns, a row of panels for each world."""
+  places: dict[str, list[Entry]] = {}
+  for one in found:
+    places.setdefault(one.world, []).append(one)
+  heights = [0.9 + 0.3 * len(there) for there in places.values()]
+  canvas = figure.Figure(figsize=(8.0, sum(heights)), layout='constrained')
+  panels = canvas.subplots(
+      len(heights), 2, squeeze=False, height_ratios=heights
+  )
+  for (world, there), (left, right) in zip(places.items(), panels, strict=True):
+    for y, one in enumerate(there):
+      if one.own.hacking is not None:
+        _mark(left, y, one.own.hacking.rate.scaled(100.0), '#D55E00', 'o')
+      _mark(right, y - 0.12, one.own.summary.true_return, '#0072B2', 'o')
+      if one.twin is not None:
+        _mark(right, y + 0.12, one.twin.summary.true_return, '#767676', 's')
+    for axes, label in ((left, 'hack rate (%)'), (right, 'true return')):
+      axes.set_xlabel(label)
+      axes.set_ylim(len(there) - 0.5, -0.5)
+      axes.set_yticks(range(len(there)), [one.own.run.name for one in there])
+    left.set_title(world, loc='left')
+    left.set_xlim(-3.0, 103.0)
+    right.set_title('circles: the run, squares: its secure twin', loc='left')
+    right.tick_params(labelleft=False)
+    most = there[0].own.run.world.best_mean_return
+    right.set_xlim(right=1.03 * most)
   return canvas
 
 
+def _mark(
+    axes: Any, y: float, value: intervals.Interval, colour: str, marker: str
+) -> None:
+  """Draws a figure and its interval, if it has one."""
+  axes.plot([value.low, value.high], [y, y], color=colour, linewidth=1.5)
+  axes.plot(value.estimate, y, marker, color=colour, clip_on=False)
+
+
 def main() -> None:
-  report, sweep, output = map(pathlib.Path, sys.argv[1:])
-  text = (report / 'tables.csv').read_text(encoding='utf-8')
-  rows = {row['run']: row for row in csv.DictReader(text.splitlines())}
-  print(tables.markdown([_HEADER, *lines(rows, sweep)]))
+  picture, *folders = map(pathlib.Path, sys.argv[1:])
+  found = [one for folder in folders for one in entries(folder)]
+  for rows in (lines(found), worlds(found)):
+    if len(rows) > 1:
+      print(tables.markdown(rows), end='\n\n')
   with matplotlib.rc_context(charts.STYLE):
-    draw(rows).savefig(output, dpi=120, metadata={'Software': None})
+    draw(found).savefig(picture, dpi=120, metadata={'Software': None})
 
 
 if __name__ == '__main__':

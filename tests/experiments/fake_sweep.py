@@ -48,6 +48,8 @@ _LEVELS = {
     'random': (1.1, 0.02, 0.03),
 }
 STAKE = 17.0
+# Metrics of learners, at each point of a curve.
+METRICS: dict[str, float] = {}
 
 
 def experiment(**changes: Any) -> experiment_specs.ExperimentSpec:
@@ -206,7 +208,7 @@ def _trace(
 def _write_training(
     path: pathlib.Path, job: jobs.Job, levels: np.ndarray, rng: Any
 ) -> list[str]:
-  settings = job.experiment.training
+  settings = job.training
   steps = range(settings.curve_every, settings.steps + 1, settings.curve_every)
   curve, timing, episodes = [], [], []
   for step in steps:
@@ -221,7 +223,7 @@ def _write_training(
         'own': dict.fromkeys(job.design.registers, corruption),
     }  # fmt: skip
     curve.append(
-        {**figures, 'num_episodes': 2, 'num_invalid': 0, 'learner': {},
+        {**figures, 'num_episodes': 2, 'num_invalid': 0, 'learner': METRICS,
          'gain': STAKE * gain}
     )  # fmt: skip
     episode = {

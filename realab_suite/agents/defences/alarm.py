@@ -21,6 +21,8 @@ class Alarm(base.Defence):
     penalty: What is subtracted from the reward.
   """
 
+  ALARMS = True
+
   kind: Literal['alarm']
   register_name: str = pydantic.Field(alias='register')
   above: Annotated[float, pydantic.Field(ge=-1e9, le=1e9)] = 0.5

@@ -13,7 +13,7 @@ off, and which steps count. A design declares it as an option of its learner:
 import abc
 from collections.abc import Mapping
 import dataclasses
-from typing import Any, NamedTuple, final
+from typing import Any, ClassVar, NamedTuple, final
 
 import jax
 import numpy as np
@@ -70,6 +70,9 @@ class Defence(validation.Model):
   Attributes:
     kind: Name under which the class is registered.
   """
+
+  # True if it changes suspicious steps alone, so that each change is an alarm.
+  ALARMS: ClassVar[bool] = False
 
   kind: str
 

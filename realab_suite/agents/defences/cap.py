@@ -27,6 +27,8 @@ class Cap(base.Defence):
     excess: Weight with which the excess above `total` is charged.
   """
 
+  ALARMS = True
+
   kind: Literal['cap']
   low: _Number = -1e9
   high: _Number = 1e9
