@@ -82,6 +82,8 @@ class Learner(abc.ABC):
   OPTIONS: ClassVar[type[Options]]
   # The option with the name of the register whose reading is learned from.
   READS: ClassVar[str]
+  # True if it can learn from the actions of others; see `watch`.
+  is_off_policy = False
   # Networks and the state of the optimiser, a pytree of arrays that a subclass
   # makes in `__init__`.
   _networks: Any
@@ -149,6 +151,43 @@ class Learner(abc.ABC):
     Raises:
       SpecError: If the observation does not match its spec.
     """
+    observation = self._learn_from(time_step)
+    choice = self._choose(observation, self._act_keys(), greedy=False)
+    choice = self._steered(choice, time_step)
+    self._last = {'observation': observation, 'choice': choice}
+    self._num_acts += 1
+    return self._encode(choice)
+
+  @jax_settings.pinned()
+  def watch(self, time_step: TimeStep, actions: np.ndarray) -> None:
+    """Learns from the outcome of the last actions, and is shown the next ones.
+
+    Like `step`, except that another has chosen the actions.
+
+    Args:
+      time_step: Same as in `step`.
+      actions: Actions that followed it, `(worlds, *action_spec.shape)`; any
+        where an episode has ended.
+
+    Raises:
+      SpecError: If it learns from its own actions alone, or the observation
+        does not match its spec.
+    """
+    if not self.is_off_policy:
+      raise errors.SpecError(
+          f'learner {self._options.kind!r}: learns from its own actions alone,'
+          ' as set here; allowed for recorded episodes are behavioural_cloning,'
+          ' and q_learning without a gate'
+      )
+    observation = self._learn_from(time_step)
+    # Queries stand before the index of an action.
+    indices = np.reshape(actions, (self._num_envs, -1))[:, -1]
+    choice = {'action': indices.astype(np.int32)}
+    self._last = {'observation': observation, 'choice': choice}
+    self._num_acts += 1
+
+  def _learn_from(self, time_step: TimeStep) -> features.Packed:
+    """Learns from the outcome of the last choice; returns the observation."""
     # The last observation has the frames before this one, also in `state`.
     earlier = self._last and self._last['observation']
     stacked = self.stack(time_step, earlier)
@@ -165,11 +204,7 @@ class Learner(abc.ABC):
           **self._also_read(time_step),
       }
       self._observe(transition, observation)
-    choice = self._choose(observation, self._act_keys(), greedy=False)
-    choice = self._steered(choice, time_step)
-    self._last = {'observation': observation, 'choice': choice}
-    self._num_acts += 1
-    return self._encode(choice)
+    return observation
 
   def _discount(self, time_step: TimeStep) -> np.ndarray:
     """Returns the weight of what follows a step, `(worlds,)`."""

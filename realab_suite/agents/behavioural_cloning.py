@@ -1,7 +1,8 @@
-"""Online behavioural cloning of the action index in a register.
+"""Behavioural cloning of the action index in a register.
 
-The learner acts with its own policy, so demonstrations cover the states that it
-visits itself, as in DAgger.
+If the learner acts, it does so with its own policy, so demonstrations cover the
+states that it visits itself, as in DAgger. If it watches, they cover the states
+that another has visited.
 """
 
 from collections.abc import Mapping
@@ -39,6 +40,7 @@ class BehaviouralCloning(on_policy.OnPolicyLearner):
 
   OPTIONS = BehaviouralCloningOptions
   READS = 'demonstration'
+  is_off_policy = True
 
   def _initial_networks(self, generator: np.random.Generator) -> Any:
     num_actions = self._controls.check_discrete(self._options.kind)

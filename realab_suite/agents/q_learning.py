@@ -89,6 +89,7 @@ class QLearning(base.Learner):
     self._replay: Any = None
     self._num_stored = 0
     self._gate = self._trusted = None
+    self.is_off_policy = gate is None
     if gate is not None:
       setting = defences.Setting(
           options, self._encoder, self._controls, self._num_envs

@@ -2,11 +2,9 @@
 
 from collections.abc import Callable, Iterator, Mapping
 import contextlib
-import json
 import pathlib
 from typing import Any
 
-from dm_env import specs as dm_env_specs
 import numpy as np
 import pyarrow as pa
 from pyarrow import parquet
@@ -14,9 +12,10 @@ from pyarrow import parquet
 from realab_suite.datasets import columns
 from realab_suite.datasets import recording
 from realab_suite.datasets import truth
+from realab_suite.experiments import recorded_data
 from realab_suite.experiments import storage
 
-AGENT_FILE = 'agent/steps.parquet'
+AGENT_FILE = f'agent/{recorded_data.FILE}'
 """Path of the file for agents."""
 
 # Rows of a table are written when they have this many bytes.
@@ -46,31 +45,16 @@ def agent_table(agent: recording.AgentStream, episode_id: int) -> pa.Table:
   fields = [columns.AGENT.field(name) for name in values]
   arrays = [pa.array(values[field.name], field.type) for field in fields]
   for key, spec in agent.observation_spec.items():
-    fields.append(_array_field(key, spec, nullable=False))
+    fields.append(recorded_data.array_field(key, spec))
     stacked = np.stack([one.observation[key] for one in time_steps])
     arrays.append(_array(stacked, fields[-1].type))
-  fields.append(_array_field('action', agent.action_spec, nullable=True))
+  fields.append(recorded_data.array_field('action', agent.action_spec))
   kind = fields[-1].type
   # There is no action after the last time step.
   arrays.append(
       pa.concat_arrays([_array(agent.actions, kind), pa.nulls(1, kind)])
   )
   return pa.Table.from_arrays(arrays, schema=pa.schema(fields))
-
-
-def _array_field(
-    name: str, spec: dm_env_specs.Array, nullable: bool
-) -> pa.Field:
-  kind = pa.from_numpy_dtype(spec.dtype)
-  if spec.shape:
-    kind = pa.list_(kind, int(np.prod(spec.shape)))
-  metadata = {'shape': json.dumps(list(spec.shape))}
-  if spec.name and name == 'action':
-    metadata['names'] = json.dumps(spec.name.split('\t'))
-  if isinstance(spec, dm_env_specs.BoundedArray):
-    metadata['minimum'] = json.dumps(np.asarray(spec.minimum).tolist())
-    metadata['maximum'] = json.dumps(np.asarray(spec.maximum).tolist())
-  return pa.field(name, kind, nullable, metadata)
 
 
 def _array(values: np.ndarray, kind: pa.DataType) -> pa.Array:

@@ -65,6 +65,10 @@ class RunSpec(validation.Spec):
     num_seeds: Number of seeds, the first ones of the experiment; `None` for all
       of them.
     task: Domain and task, or `None` for that of the experiment.
+    data: Folder of an export (`datasets.export`) whose episodes the learner is
+      trained from, without acting; `None` if it acts. `steps` are then recorded
+      control steps.
+    twin_data: The same for the twin, recorded in the secure channel.
   """
 
   design: option_types.FilePath
@@ -77,6 +81,22 @@ class RunSpec(validation.Spec):
   task: _Task | None = pydantic.Field(
       default=None, exclude_if=lambda task: task is None
   )
+  data: option_types.FilePath | None = pydantic.Field(
+      default=None, exclude_if=lambda path: path is None
+  )
+  twin_data: option_types.FilePath | None = pydantic.Field(
+      default=None, exclude_if=lambda path: path is None
+  )
+
+  @pydantic.model_validator(mode='after')
+  def _check_data(self) -> 'RunSpec':
+    needed = self.twin and self.data is not None
+    if needed != (self.twin_data is not None):
+      raise ValueError(
+          'twin_data: goes with data and twin; allowed are all three, data'
+          ' alone, and neither'
+      )
+    return self
 
   def load(self, *, is_confined: bool = False) -> specs.DesignSpec:
     """Returns the design with the changes of this run.
@@ -255,6 +275,11 @@ class ExperimentSpec(validation.Spec):
         raise ValueError(
             f'runs.{name}.learner: design {design.name!r} has no learner;'
             ' allowed is a mapping with its kind'
+        )
+      if run.data is not None and self.training.tasks:
+        raise ValueError(
+            f'runs.{name}.data: recorded episodes are those of one task;'
+            ' allowed with it is a section training without tasks'
         )
       if run.twin and design.channel == TWIN:
         raise ValueError(

@@ -19,6 +19,7 @@ from realab_suite.config import messages
 from realab_suite.config import validation
 from realab_suite.evaluation import results
 from realab_suite.experiments import experiment_specs
+from realab_suite.experiments import recorded_data
 from realab_suite.experiments import storage
 from realab_suite.feedback import specs
 
@@ -52,6 +53,8 @@ class Job:
       well, or `None`.
     dynamics: Version and golden digest of the dynamics of the task.
     experiment: Experiment that the job belongs to, on the task of the run.
+    data: Folder of the recorded episodes that a learner is trained from, and
+      their digest, or `None`.
   """
 
   run: str
@@ -63,6 +66,7 @@ class Job:
   embedded: specs.DesignSpec | None
   dynamics: tuple[int, str | None]
   experiment: experiment_specs.ExperimentSpec
+  data: tuple[str, str] | None = None
 
   @property
   def kind(self) -> str:
@@ -119,6 +123,8 @@ class Job:
             {'task': task, 'version': one, 'digest': two}
             for task, (one, two) in zip(tasks, versions, strict=True)
         ]
+      if self.data is not None:
+        _, config['training']['data'] = self.data
       depends_on.update(versions_of_learners())
     return config
 
@@ -253,6 +259,7 @@ def _variants(
     experiment: The experiment, on the task of the run.
     name: Name of the run.
   """
+  run = experiment.runs[name]
   scripted = experiment.scripted
   names = [f'{name}.{baseline}' for baseline in scripted]
   learner = Job(
@@ -265,27 +272,35 @@ def _variants(
       embedded=None,
       dynamics=_dynamics(experiment),
       experiment=experiment,
+      data=_data(run.data),
   )
   found = [
       dataclasses.replace(
           learner,
-          run=run,
+          run=one,
           policy=policy,
-          baseline=None if run == learner.baseline else learner.baseline,
+          baseline=None if one == learner.baseline else learner.baseline,
+          data=None,
       )
-      for run, policy in zip(names, scripted.values(), strict=True)
+      for one, policy in zip(names, scripted.values(), strict=True)
   ]
   found.append(learner)
-  if experiment.runs[name].twin:
+  if run.twin:
     twin = dataclasses.replace(
         learner,
         run=f'{name}.{experiment_specs.TWIN}',
         design=experiment_specs.secure_twin(learner.design),
         twin_of=name,
         embedded=learner.design,
+        data=_data(run.twin_data),
     )
     found.append(twin)
   return found
+
+
+def _data(folder: str | None) -> tuple[str, str] | None:
+  """Returns a folder of recorded episodes and their digest, or `None`."""
+  return None if folder is None else (folder, recorded_data.digest(folder))
 
 
 def _dynamics(

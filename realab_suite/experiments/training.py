@@ -33,6 +33,7 @@ from realab_suite.experiments import jobs
 from realab_suite.experiments import kept_stakes
 from realab_suite.experiments import machines
 from realab_suite.experiments import progress
+from realab_suite.experiments import recorded_data
 from realab_suite.experiments import requirements
 from realab_suite.experiments import storage
 
@@ -123,7 +124,8 @@ def run(job: jobs.Job, output: pathlib.Path, options: Options) -> pathlib.Path:
 
 
 def make_learner(
-    job: jobs.Job, batch: batch_environment.BatchEnvironment
+    job: jobs.Job,
+    batch: batch_environment.BatchEnvironment | recorded_data.RecordedBatch,
 ) -> 'agents.Learner':
   """Returns the untrained learner of a job.
 
@@ -254,6 +256,12 @@ class _Training:
     self._total += -(-(training.adaptation or 0) // training.num_envs)
     self._save_every = -(-training.checkpoint_every // training.num_envs)
     self._point_every = -(-training.curve_every // training.num_envs)
+    # Episodes to learn from instead of acting, or `None`.
+    self._recorded = None
+    if job.data is not None:
+      data, _ = job.data
+      with contextlib.closing(job.experiment.world.load(job.design, 0)) as env:
+        self._recorded = recorded_data.load(data, env, self._num_envs)
     self._done = 0
     # Number of the batch, and its task.
     self._segment = 0
@@ -276,13 +284,18 @@ class _Training:
       self._done, self._segment = saved['done'], saved['segment']
       self._pending = saved['pending']
     with contextlib.ExitStack() as stack:
-      self._begin_segment()
-      stack.callback(lambda: self._batch.close())
-      learner = make_learner(job, self._batch)
+      if self._recorded is None:
+        self._begin_segment()
+        stack.callback(lambda: self._batch.close())
+      learner = make_learner(job, self._recorded or self._batch)
       _check_credit(job, learner.most, path.parent)
       self._add_machine(learner, saved)
       if saved is None:
-        time_step = self._batch.reset()
+        time_step = (
+            self._batch.reset()
+            if self._recorded is None
+            else self._recorded.at(0)[0]
+        )
       else:
         with self._folder.naming_checkpoint():
           time_step = self._restore(learner, saved)
@@ -364,9 +377,14 @@ class _Training:
       self._check_parent()
       if self._done == self._adapts_at:
         self._evaluate_stages(learner)
-      time_step = self._batch.step(learner.step(time_step))
-      self._done += 1
-      self._record_episodes()
+      if self._recorded is None:
+        time_step = self._batch.step(learner.step(time_step))
+        self._done += 1
+        self._record_episodes()
+      else:
+        time_step, actions = self._recorded.at(self._done)
+        learner.watch(time_step, actions)
+        self._done += 1
       display.advance(self._num_envs)
       is_over = self._done == self._total
       if is_over or self._done % self._point_every == 0:
@@ -416,7 +434,9 @@ class _Training:
       The next time step of the learner, the same with or without a restart.
     """
     world = None
-    is_replaced = self._sleep or self._task_of(self._segment + 1) != self._task
+    is_replaced = self._recorded is None and (
+        self._sleep or self._task_of(self._segment + 1) != self._task
+    )
     if is_replaced:
       # Sleeping bodies cannot be saved, and other tasks have other worlds.
       # Therefore all worlds are replaced here, with or without a restart, and
@@ -425,7 +445,7 @@ class _Training:
       self._record_episodes()
       self._segment += 1
       time_step = _truncated(time_step)
-    else:
+    elif self._recorded is None:
       world = np.frombuffer(self._batch.save().to_bytes(), np.uint8)
     self._folder.save(
         self._done * self._num_envs,
