@@ -149,9 +149,10 @@ def _payment(defence: Any, reward: str) -> Payment | str:
   if not isinstance(defence, Mapping):
     return Payment({reward: 1.0})
   kind: Any = defence.get('kind')
-  if kind in PAYMENTS:
+  is_name = isinstance(kind, str)
+  if is_name and kind in PAYMENTS:
     return PAYMENTS.get(kind)(defence, reward)
-  if kind not in DEFENCES:
+  if not is_name or kind not in DEFENCES:
     return f'has the defence {messages.quote(kind)}, which is not registered'
   one = validation.validate(DEFENCES.get(kind), defence, 'learner.defence')
   if (weights := one.pays(reward)) is None:
