@@ -121,7 +121,7 @@ class Boxes:
 
 
 def run(seed: int, gate: dict[str, Any] | None) -> tuple[float, float]:
-  """Returns what was earned, and what was read, per 100 steps at the end."""
+  """Returns the true reward and the readings per 100 steps at the end."""
   env = Boxes(_NUM_ENVS)
   learner = agents.make(
       {**_LEARNER, **({'gate': gate} if gate else {})},

@@ -176,8 +176,8 @@ class Learner(abc.ABC):
     if not self.is_off_policy:
       raise errors.SpecError(
           f'learner {self._options.kind!r}: learns from its own actions alone,'
-          ' as set here; allowed for recorded episodes are behavioural_cloning,'
-          ' and q_learning without a gate'
+          ' as set here; allowed for recorded episodes are off-policy learners,'
+          ' such as behavioural_cloning, and q_learning without a gate'
       )
     observation = self._learn_from(time_step)
     # Queries stand before the index of an action.

@@ -35,7 +35,8 @@ class PolicyGradientOptions(on_policy.OnPolicyOptions):
     memory: Number of units of a recurrent memory before the networks, or 0.
     time_limit: What follows an episode that the time limit ends: `continues` if
       it is worth what the last observation is, as in an episode without end, or
-      `ends` if it is worth nothing, as the evaluation counts it.
+      `ends` if it is worth nothing, as the evaluation counts it. In a run with
+      sleep, episodes end at checkpoints as by a time limit.
     defence: What the learner does about corrupted rewards; `None` for nothing.
   """
 

@@ -140,7 +140,7 @@ def _approval_beside(options: _Options, reward: str) -> Payment:
 
 
 def _payment(defence: Any, reward: str) -> Payment | str:
-  """Returns what a learner is paid, or the reason why nothing is known of it.
+  """Returns the payment of a learner, or the reason why it is not known.
 
   Args:
     defence: Options of the defence, or `None`.

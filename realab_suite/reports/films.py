@@ -33,11 +33,12 @@ WIDTHS = {'top_down': 480, 'first_person': 640}
 OnStep = Callable[[Any, tracking.Track], None]
 """Function that is called with the physics and the track at each step."""
 
+# The same frames give the same bytes, whatever the processors and their number.
+# Without `cpu-independent`, they do not even on one machine.
+_SAME_BYTES = 'threads=1:lookahead-threads=1:cpu-independent=1'
 # Codec of each kind of file, its options, and those of the container.
 _CODECS: dict[str, tuple[str, dict[str, str], dict[str, str]]] = {
-    # The same frames give the same bytes only with this option, on one machine
-    # as well.
-    '.mp4': ('libx264', {'x264-params': 'cpu-independent=1'}, {}),
+    '.mp4': ('libx264', {'x264-params': _SAME_BYTES}, {}),
     # Repeats without end.
     '.webp': ('libwebp_anim', {}, {'loop': '0'}),
 }

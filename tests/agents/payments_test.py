@@ -185,7 +185,7 @@ def test_a_query_of_a_defence_belongs_to_the_objective():
     ('defence', 'reason'),
     [
         ({'kind': 'silent'}, "has the defence 'silent', which declares no sum"),
-        ({'kind': 'nobody'}, "has the defence 'nobody', which is not regist"),
+        ({'kind': 'missing'}, "has the defence 'missing', which is not regist"),
         ({'kind': 'learned_reward', 'source': 'comparisons', 'clip': 2},
          'learns a reward from comparisons'),
     ],

@@ -124,7 +124,7 @@ def _outcome(learner, design):
     ('design', 'learner', 'drawn', 'actions', 'observed'),
     [
         (_REWARD, _Q, tuple(_ANY), _ONE, 59),
-        # Nobody has pushed, so the value of a push is what it was: about 0.
+        # Without a push, its value stays what it was: about 0.
         (_REWARD, _Q, (_WAIT, _WORK), _HONEST, 10),
         # The demonstration of `work` is its index, 1.
         (_IMITATION, _CLONES, (_WORK,), _HONEST, 10),

@@ -172,6 +172,8 @@ def test_a_film_shows_every_step_and_filming_changes_nothing(tmp_path):
   meta = imageio.immeta(tmp_path / 'film.mp4', plugin='pyav')
   assert meta['fps'] == 10
   assert meta['codec'] == 'h264'
+  # x264 writes its settings into the film: by default, many threads.
+  assert b' threads=1 ' in (tmp_path / 'film.mp4').read_bytes()
   # Players show their controls over the lower edge, so the strip is above.
   view = frames[:, -films.HEIGHT :]
   assert (frames[0, 2, 2] < 60).all()
