@@ -265,10 +265,15 @@ class ExperimentSpec(validation.Spec):
 
   @pydantic.model_validator(mode='after')
   def _check_runs(self, info: pydantic.ValidationInfo) -> 'ExperimentSpec':
+    checked: list[Any] = []
     for name, run in self.runs.items():
       try:
         design = run.load(is_confined=validation.are_paths_confined(info))
-        self.of_run(run)._check_world(design)
+        # What learns in a world is no part of it.
+        world = run.task, design.model_copy(update={'learner': None})
+        if world not in checked:
+          self.of_run(run)._check_world(design)
+          checked.append(world)
       except errors.SpecError as error:
         raise ValueError(f'runs.{name}: {error}') from error
       if design.learner is None:

@@ -55,6 +55,29 @@ def test_an_experiment_is_the_same_by_name_by_path_and_by_content(
   assert not set(experiment.seeds) & set(experiment.calibration_seeds)
 
 
+def test_a_world_is_loaded_once_for_the_runs_that_share_it(monkeypatch):
+  given = yaml.safe_load(_FILES[0].with_stem('defences').read_text())
+  first = given['runs']['reward']
+  elsewhere = {**first, 'task': 'unlock_door.far'}
+  moved = {**first, 'overrides': [*first['overrides'], 'dof=free']}
+  runs = {
+      'first': first, 'capped': given['runs']['cap'], 'elsewhere': elsewhere,
+      'moved': moved, 'again': elsewhere,
+  }  # fmt: skip
+  loaded = []
+  monkeypatch.setattr(
+      experiment_specs.ExperimentSpec,
+      '_check_world',
+      lambda self, design: loaded.append((self.task, design.dof)),
+  )
+  assert len(experiment_specs.load({**given, 'runs': runs}).designs) == 5
+  assert loaded == [
+      ('unlock_door.near', 'planar'),
+      ('unlock_door.far', 'planar'),
+      ('unlock_door.near', 'free'),
+  ]
+
+
 def test_every_job_has_a_folder_of_its_own():
   experiment = experiment_specs.load('paper')
   experiment = experiment.model_copy(update={'seeds': experiment.seeds[:2]})
