@@ -146,8 +146,8 @@ def _tax(one: Entry) -> float | None:
 
 def _false_alarms(one: Entry) -> float | None:
   """Returns the share of changed steps at the end of training, in percent."""
-  defence = _defence(one.own.run)
-  if one.twin is None or defence is None or not defence.ALARMS:
+  defence, gate = _defence(one.own.run), _learner(one.own.run).get('gate')
+  if one.twin is None or not (gate or (defence and defence.ALARMS)):
     return None
   shares = [
       point['learner']['changed']

@@ -153,7 +153,7 @@ class Learner(abc.ABC):
     """
     observation = self._learn_from(time_step)
     choice = self._choose(observation, self._act_keys(), greedy=False)
-    choice = self._steered(choice, time_step)
+    choice = self._steered(choice, time_step, observation)
     self._last = {'observation': observation, 'choice': choice}
     self._num_acts += 1
     return self._encode(choice)
@@ -339,9 +339,11 @@ class Learner(abc.ABC):
   def _encode(self, choice: Choice) -> np.ndarray:
     return self._controls.encode(choice['action'], self._queries(choice))
 
-  def _steered(self, choice: Choice, time_step: TimeStep) -> Choice:
+  def _steered(
+      self, choice: Choice, time_step: TimeStep, observation: features.Packed
+  ) -> Choice:
     """Returns the choice to act on, which may not be the learner's own."""
-    del time_step
+    del time_step, observation
     return choice
 
   def _also_read(self, time_step: TimeStep) -> dict[str, Any]:

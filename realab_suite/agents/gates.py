@@ -5,36 +5,34 @@ model of readings and a value function are learned in a first phase, and kept.
 Later transitions whose reading the model does not expect are held back, until
 there are enough for a *trial*: two copies of the networks are trained, one with
 these transitions and one without, and each acts in half of the worlds. If the
-one with them earns less by the model that was kept, they are refused.
+one with them earns less by what was kept, they are refused.
 
 The trial is a part of training, because a learner cannot reset its worlds. Its
 control steps and its gradient steps are the price of the gate.
 """
 
-from collections.abc import Callable, Mapping
-import functools
+from collections.abc import Callable
 from typing import Annotated, Any, final
 
-import jax
 import numpy as np
 import pydantic
 
-from realab_suite.agents import base
 from realab_suite.agents import defences
 from realab_suite.agents import networks
-from realab_suite.agents import training
 from realab_suite.agents import trusted_policies
 from realab_suite.config import validation
 
 _Positive = Annotated[int, pydantic.Field(ge=1, le=10**9)]
-_Samples = dict[str, Any]
-# Trains networks: on minibatches that a function may change.
-Train = Callable[[Any, int, Callable[[_Samples], _Samples]], Any]
+_COUNTED = (
+    'trials', 'unexpected', 'refused', 'accepted', 'gradients', 'trial_steps',
+)  # fmt: skip
 
 
 @final
-class GateOptions(validation.Model):
-  """Options of the gate.
+class Gate(validation.Model):
+  """Holds back unexpected readings, and decides about them in trials.
+
+  It keeps no state, but changes the one that `initial_state` returned.
 
   Attributes:
     threshold: Largest difference between a reading and its prediction that is
@@ -45,7 +43,7 @@ class GateOptions(validation.Model):
       the learner's own.
     alarms: Number of unexpected readings that start a trial.
     gradients: Number of gradient steps of each copy, about.
-    injected: Share of a minibatch that consists of them.
+    injected: Share of a minibatch that begins with them.
     trial_steps: Number of control steps of each world in a trial.
   """
 
@@ -58,7 +56,7 @@ class GateOptions(validation.Model):
   trial_steps: _Positive = 250
 
   @pydantic.model_validator(mode='after')
-  def _without_cloning(self) -> 'GateOptions':
+  def _without_cloning(self) -> 'Gate':
     if self.trusted is not None and self.trusted.clone_steps:
       raise ValueError(
           f'trusted.clone_steps: {self.trusted.clone_steps}; allowed is 0,'
@@ -66,265 +64,87 @@ class GateOptions(validation.Model):
       )
     return self
 
-
-@final
-class Gate:
-  """Holds back unexpected readings, and decides about them in trials."""
-
-  def __init__(
-      self,
-      options: GateOptions,
-      setting: defences.Setting,
-      generator: np.random.Generator,
-  ) -> None:
-    """Makes a gate.
-
-    Args:
-      options: Options of the gate.
-      setting: The learner.
-      generator: Random generator of the initial weights.
-    """
-    self._options, self._setting = options, setting
-    network = networks.Network(
-        setting.encoder,
-        setting.options.hidden,
-        1,
-        0.01,
-        generator,
-        setting.controls.size,
-    )
-    optimizer = training.optimizer(setting.options)
-    self._model: Any = network, optimizer.init(network)
-    self._value: Any = None
-    self._scale = 1.0
-    self._held: list[dict[str, Any]] = []
-    # The copy of the networks that learned from what is held back.
-    self._convinced: Any = None
-    self._scores = np.zeros(setting.num_envs)
-    self._num_tried = 0
-    self._counts = dict.fromkeys(
-        (
-            'trials', 'unexpected', 'refused', 'accepted', 'gradients',
-            'trial_steps',
-        ),
-        0,
-    )  # fmt: skip
-
-  @property
-  def is_open(self) -> bool:
-    """True once the model is kept."""
-    return self._value is not None
-
-  @property
-  def is_trying(self) -> bool:
-    """True during a trial, in which nothing is learned."""
-    return self._convinced is not None
-
-  @property
-  def convinced(self) -> tuple[Any, np.ndarray]:
-    """The copy that learned from unexpected readings, and where it acts."""
-    return self._convinced, np.arange(self._setting.num_envs) % 2 == 1
+  def initial_state(self, trained: Any, num_envs: int) -> dict[str, Any]:
+    """Returns the state of a gate for untrained networks, a pytree."""
+    return {
+        # The model has the discount 0. `convinced` acts in every second world.
+        **dict.fromkeys(('model', 'values', 'convinced'), trained),
+        'scale': 1.0, 'is_open': False, 'is_trying': False, 'num_tried': 0,
+        'scores': np.zeros(num_envs), 'is_judged': np.zeros(num_envs, bool),
+        'changed': 0.0, 'counts': dict.fromkeys(_COUNTED, 0),
+    }  # fmt: skip
 
   def sift(
-      self, transition: dict[str, Any], observation: Any, number: int
+      self, transition: dict[str, Any], setting: defences.Setting, state: Any
   ) -> dict[str, Any]:
-    """Returns a transition without what is held back.
+    """Returns a transition without what is unexpected.
 
-    Args:
-      transition: Transition of all worlds; see `base.Learner`.
-      observation: Packed observation after it.
-      number: Number of the transition.
+    Its entry `is_held` marks what is held back until a trial decides about it.
     """
-    is_valid = transition['is_valid']
-    if not self.is_open:
-      if self._options.trusted is not None:
-        is_valid = is_valid & transition['is_trusted']
-      return {**transition, 'is_valid': is_valid}
-    predicted = self._predicted(transition)
-    self._counts['trial_steps'] += self.is_trying * len(is_valid)
-    if self.is_trying:
-      earned = self._setting.options.gamma**self._num_tried * predicted
-      self._scores = self._scores + np.where(is_valid, earned, 0.0)
-      self._num_tried += 1
+    is_valid, counts = transition['is_valid'], state['counts']
+    values = _values('model', transition['observation'], setting, state)
+    action = transition['choice']['action'][:, np.newaxis]
+    predicted = np.take_along_axis(values, action, axis=1)[:, 0]
     error = np.abs(transition['reading'] - predicted)
-    unexpected = is_valid & (error > self._options.threshold)
-    self._counts['unexpected'] += int(unexpected.sum())
-    if not self.is_trying:
-      self._hold(transition, observation, np.flatnonzero(unexpected), number)
-    return {**transition, 'is_valid': is_valid & ~unexpected}
-
-  def _predicted(self, transition: dict[str, Any]) -> np.ndarray:
-    data = defences.data_of(transition, self._setting, with_readings=False)
-    return self._scale * np.asarray(_values(self._model[0], data))[..., 0]
-
-  def _hold(
-      self, transition: Any, observation: Any, worlds: np.ndarray, number: int
-  ) -> None:
-    for world in worlds[: self._options.alarms - len(self._held)].tolist():
-      parts = {
-          'observation': transition['observation'],
-          'action': transition['choice']['action'],
-          'total': transition['reading'],
-          'factor': transition['discount'] * self._setting.options.gamma,
-          'later': observation,
-      }
-      one = jax.tree.map(lambda x, i=world: np.array(x[i]), parts)
-      self._held.append({**one, 'where': np.array([number, world])})
-
-  def learn(
-      self,
-      readings: Callable[[], _Samples],
-      scale: float,
-      value: Any,
-      done: int,
-  ) -> None:
-    """Fits the model, and keeps it once `done` is `fit_steps`.
-
-    Args:
-      readings: Draws minibatches of single readings, in units of the register.
-      scale: Number by which the learner divides readings.
-      value: Networks whose values are kept.
-      done: Number of control steps so far, summed over worlds.
-    """
-    if self.is_open:
-      return
-    if done >= self._options.fit_steps:
-      self._value = value
-      return
-    self._scale = scale
-    drawn = readings()
-    data = defences.data_of(
-        {'observation': drawn['observation'], 'choice': drawn},
-        self._setting,
-        with_readings=False,
-    )
-    self._counts['gradients'] += len(drawn['total'])
-    self._model = _fit(
-        self._setting.options,
-        self._model,
-        data,
-        drawn['total'] / np.float32(scale),
-        drawn['weight'],
-    )
+    is_alarm = is_valid & (error > self.threshold) & state['is_open']
+    state['changed'] = is_alarm.sum() / max(1, is_valid.sum())
+    counts['unexpected'] += is_alarm.sum()
+    # What follows in an episode says little without what was decided about.
+    state['is_judged'] = state['is_judged'] & is_valid
+    is_held = is_alarm & ~state['is_judged']
+    if state['is_trying']:
+      earned = setting.options.gamma ** state['num_tried'] * predicted
+      state['scores'] = state['scores'] + np.where(is_valid, earned, 0.0)
+      state['num_tried'] += 1
+      counts['trial_steps'] += len(is_valid)
+    return {**transition, 'is_valid': is_valid & ~is_alarm, 'is_held': is_held}
 
   def decide(
-      self, trained: Any, observation: Any, train: Train
-  ) -> tuple[Any, list[np.ndarray]]:
-    """Starts a trial or ends one, where one is due.
+      self,
+      trained: Any,
+      replay: Any,
+      num_held: int,
+      observation: Any,
+      setting: defences.Setting,
+      state: dict[str, Any],
+      train: Callable[..., Any],
+  ) -> Any:
+    """Starts a trial or ends one, if it is due; returns the networks then.
 
     Args:
-      trained: Networks of the learner, with the states of their optimisers.
-      observation: Packed observation of the next step.
+      trained: Networks of the learner.
+      replay: Its transitions; what is accepted becomes valid.
+      num_held: Number of those held back whose returns are known.
+      observation: Packed observation after them.
+      setting: The learner.
+      state: State, which changes.
       train: Trains networks for a number of gradient steps.
-
-    Returns:
-      The networks to go on with, and the numbers of the transitions that were
-      accepted, each with its world.
     """
-    options = self._options
-    if not self.is_trying:
-      if len(self._held) == options.alarms:
-        self._convinced = train(trained, options.gradients, self._injected)
-        trained = train(trained, options.gradients, lambda samples: samples)
-        each = self._setting.options.gradients_per_update
-        self._counts['gradients'] += 2 * each * -(-options.gradients // each)
-        self._counts['trials'] += 1
-      return trained, []
-    if self._num_tried < options.trial_steps:
-      return trained, []
-    blind = defences.blinded(observation, self._setting)
-    later = _values(self._value, self._setting.encoder.encode(blind))
-    best = self._scale * np.asarray(later).max(axis=-1)
-    scores = self._scores + self._setting.options.gamma**self._num_tried * best
-    convinced, acts = self.convinced
-    is_worse = scores[acts].mean() < scores[~acts].mean()
-    self._counts['refused' if is_worse else 'accepted'] += len(self._held)
-    accepted = [] if is_worse else [one['where'] for one in self._held]
-    self._held, self._convinced, self._num_tried = [], None, 0
-    self._scores = np.zeros_like(self._scores)
-    return (trained if is_worse else convinced), accepted
-
-  def _injected(self, samples: _Samples) -> _Samples:
-    """Returns minibatches with what is held back in a share of each."""
-    shape = samples['total'].shape
-    number = max(1, int(self._options.injected * shape[1]))
-    held = jax.tree.map(
-        lambda *x: np.stack(x),
-        *[{k: v for k, v in one.items() if k != 'where'} for one in self._held],
-    )
-    held['weight'] = np.ones(len(self._held), np.float32)
-    chosen = np.resize(np.arange(len(self._held)), (shape[0], number))
-
-    def put(old: np.ndarray, new: np.ndarray) -> np.ndarray:
-      mixed = np.array(old)
-      mixed[:, :number] = new[chosen]
-      return mixed
-
-    return jax.tree.map(put, samples, held)
-
-  @property
-  def metrics(self) -> dict[str, float]:
-    """The price of the gate, by name.
-
-    Numbers of trials; of unexpected readings, and of those that a trial has
-    refused and accepted (others came while one was under way, and are left
-    out); of gradient steps of the model and of the copies; and of control steps
-    in trials, summed over worlds.
-    """
-    return {f'gate_{name}': float(n) for name, n in self._counts.items()}
-
-  def state(self) -> dict[str, Any]:
-    """Returns the complete state, as plain data."""
-    kept = (self._model, self._value, self._convinced)
-    return {
-        'kept': [None if one is None else base.to_plain(one) for one in kept],
-        'scale': self._scale,
-        'held': [dict(one) for one in self._held],
-        'scores': self._scores,
-        'num_tried': self._num_tried,
-        'counts': dict(self._counts),
-    }
-
-  def set_state(self, state: Mapping[str, Any], trained: Any) -> None:
-    """Continues from a state that `state` returned.
-
-    Args:
-      state: The state.
-      trained: Networks of the learner, for their structure.
-    """
-    likes = (self._model, trained[0][0], trained)
-    self._model, self._value, self._convinced = (
-        None if kept is None else base.from_plain(like, kept)
-        for like, kept in zip(likes, state['kept'], strict=True)
-    )
-    self._scale = float(state['scale'])
-    self._held = [dict(one) for one in state['held']]
-    self._scores, self._num_tried = state['scores'], int(state['num_tried'])
-    self._counts = dict(state['counts'])
+    if not state['is_trying']:
+      if num_held >= self.alarms:
+        state['convinced'] = train(trained, self.gradients, self.injected)
+        trained = train(trained, self.gradients)
+        state |= {'is_trying': True, 'num_tried': 0}
+        state['scores'] = np.zeros(setting.num_envs)
+        state['counts']['trials'] += 1
+      return trained
+    if state['num_tried'] < self.trial_steps:
+      return trained
+    later = _values('values', observation, setting, state).max(axis=-1)
+    scores = state['scores'] + setting.options.gamma**self.trial_steps * later
+    is_worse = scores[1::2].mean() < scores[::2].mean()
+    decision = 'refused' if is_worse else 'accepted'
+    state['counts'][decision] += replay['is_held'].sum()
+    replay['is_valid'] |= replay['is_held'] & (not is_worse)
+    replay['is_held'][:] = state['is_trying'] = False
+    state['is_judged'] = np.ones(setting.num_envs, bool)
+    return trained if is_worse else state['convinced']
 
 
-@jax.jit
-def _values(network: networks.Network, data: dict[str, jax.Array]) -> jax.Array:
-  return network(data)
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _fit(
-    options: Any,
-    trained: Any,
-    data: dict[str, jax.Array],
-    target: jax.Array,
-    weight: jax.Array,
-) -> Any:
-  """Takes a gradient step for each minibatch, and returns the model."""
-
-  def loss(network: networks.Network, sample: Any) -> Any:
-    features, reading, counts = sample
-    error = network(features)[..., 0] - reading
-    value = training.mean(error**2, counts)
-    return value, {'loss': value}
-
-  def one_step(carry: Any, sample: Any) -> Any:
-    return training.descend(options, loss, carry, sample)
-
-  return jax.lax.scan(one_step, trained, (data, target, weight))[0]
+def _values(
+    kept: str, observation: Any, setting: defences.Setting, state: Any
+) -> np.ndarray:
+  """Returns values of all actions, of networks to which readings are hidden."""
+  blind = defences.blinded(observation, setting)
+  values = networks.values(setting.encoder, state[kept][0][0], blind)
+  return np.float32(state['scale']) * np.asarray(values)

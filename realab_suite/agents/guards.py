@@ -54,12 +54,7 @@ class Guard:
     """
     if self._trusted is None:
       return choice
-    is_first = np.asarray(time_step.step_type) == base.FIRST
-    action = choice['action'].copy()
-    action[: self._trusted.num_worlds] = self._trusted.act(
-        time_step.observation, is_first, key
-    )
-    return {**choice, 'action': action}
+    return self._trusted.steer(choice, time_step, key)
 
   def _key_of(self, register: str) -> str:
     """Returns the key in observations of the reading of a register."""
@@ -79,7 +74,7 @@ class Guard:
     """Returns what it adds to the transition that ends with a time step."""
     is_trusted = np.zeros(self._setting.num_envs, bool)
     if self._trusted is not None:
-      is_trusted[: self._trusted.num_worlds] = True
+      is_trusted = self._trusted.acts
     readings = {
         name: np.array(time_step.observation[key], np.float32)
         for name, key in self._reads.items()

@@ -390,6 +390,14 @@ def probabilities(
   return jax.nn.softmax(policy(encoder.encode(observation)).logits)
 
 
+@functools.partial(jax.jit, static_argnums=0)
+def values(
+    encoder: features.Encoder, network: Network, observation: features.Packed
+) -> jax.Array:
+  """Returns the value of each discrete action, `(worlds, actions)`."""
+  return network(encoder.encode(observation))
+
+
 def _orthogonal(
     shape: tuple[int, ...], scale: float, generator: np.random.Generator
 ) -> jax.Array:

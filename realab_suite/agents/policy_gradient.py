@@ -162,7 +162,10 @@ class PolicyGradient(on_policy.OnPolicyLearner):
     return None if self._guard is None else self._guard.most
 
   def _steered(
-      self, choice: base.Choice, time_step: base.TimeStep
+      self,
+      choice: base.Choice,
+      time_step: base.TimeStep,
+      observation: features.Packed,
   ) -> base.Choice:
     if self._guard is None:
       return choice

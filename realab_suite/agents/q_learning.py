@@ -1,6 +1,6 @@
 """Q-learning (double DQN), with the reading of a register as reward."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 import functools
 from typing import Any, Literal, final
 
@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from realab_suite import errors
 from realab_suite.agents import base
 from realab_suite.agents import defences
 from realab_suite.agents import features
@@ -55,7 +56,7 @@ class QLearningOptions(base.Options):
   gradients_per_update: base.Positive = 8
   minibatch: base.Positive = 512
   target_rate: base.Rate = 0.01
-  gate: gates.GateOptions | None = None
+  gate: gates.Gate | None = None
 
 
 @base.LEARNERS.add('q_learning')
@@ -88,13 +89,19 @@ class QLearning(base.Learner):
     )
     self._replay: Any = None
     self._num_stored = 0
-    self._gate = self._trusted = None
+    self._gate, self._trusted = gate, None
+    self._gate_state: dict[str, Any] = {}
+    self._setting = defences.Setting(
+        options, self._encoder, self._controls, self._num_envs
+    )
     self.is_off_policy = gate is None
     if gate is not None:
-      setting = defences.Setting(
-          options, self._encoder, self._controls, self._num_envs
-      )
-      self._gate = gates.Gate(gate, setting, self._generator('initial', 1))
+      if self._num_envs < 2:
+        raise errors.SpecError(
+            'learner.gate: in 1 world; allowed are more, because a trial'
+            ' compares two halves of them'
+        )
+      self._gate_state = gate.initial_state(self._networks, self._num_envs)
       if gate.trusted is not None:
         self._trusted = gate.trusted.make(
             self._controls,
@@ -103,37 +110,27 @@ class QLearning(base.Learner):
             'learner.gate',
         )
 
-  def _generator(self, stream: str, number: int) -> np.random.Generator:
-    """Returns a random generator for the gate."""
-    key = base.folded(base.folded(self._keys[stream], self._num_acts), number)
-    return np.random.Generator(np.random.Philox(key=key.astype(np.uint64)))
+  @property
+  def _exploration(self) -> np.float32:
+    """Probability of a random action."""
+    return training.exploration(self._options, self.num_steps)
 
   def _steered(
-      self, choice: base.Choice, time_step: base.TimeStep
+      self,
+      choice: base.Choice,
+      time_step: base.TimeStep,
+      observation: features.Packed,
   ) -> base.Choice:
-    if self._gate is None:
-      return choice
-    action = choice['action'].copy()
-    key = self._act_keys()['query']
-    if self._gate.is_trying:
-      earlier = self._last and self._last['observation']
-      seen = self._encoder.pack(self.stack(time_step, earlier), self._num_envs)
-      networks_, acts = self._gate.convinced
-      exploration = training.exploration(self._options, self.num_steps)
-      other = _act(self._encoder, networks_[0][0], seen, exploration, key)
-      action = np.where(acts, np.asarray(other), action)
-    elif self._trusted is not None and not self._gate.is_open:
-      is_first = np.asarray(time_step.step_type) == base.FIRST
-      action[: self._trusted.num_worlds] = self._trusted.act(
-          time_step.observation, is_first, key
-      )
-    return {**choice, 'action': action}
-
-  def _also_read(self, time_step: base.TimeStep) -> dict[str, Any]:
-    if self._trusted is None:
-      return {}
-    is_trusted = np.arange(self._num_envs) < self._trusted.num_worlds
-    return {'is_trusted': is_trusted}
+    state, key = self._gate_state, self._act_keys()['query']
+    if state.get('is_trying'):
+      network, exploration = state['convinced'][0][0], self._exploration
+      other = _act(self._encoder, network, observation, exploration, key)
+      action = choice['action'].copy()
+      action[1::2] = np.asarray(other)[1::2]
+      return {**choice, 'action': action}
+    if self._trusted is not None and not state['is_open']:
+      return self._trusted.steer(choice, time_step, key)
+    return choice
 
   def _choose(
       self,
@@ -141,44 +138,37 @@ class QLearning(base.Learner):
       keys: Mapping[str, np.ndarray],
       greedy: bool,
   ) -> base.Choice:
-    exploration = (
-        np.float32(0.0)
-        if greedy
-        else training.exploration(self._options, self.num_steps)
-    )
     action = _act(
         self._encoder,
         self._networks[0][0],
         observation,
-        exploration,
+        np.float32(0.0) if greedy else self._exploration,
         keys['act'],
     )
     return {'action': np.asarray(action)}
 
   def _probabilities(self, observation: features.Packed) -> Any:
     return _probabilities(
-        self._encoder,
-        self._networks[0][0],
-        observation,
-        training.exploration(self._options, self.num_steps),
+        self._encoder, self._networks[0][0], observation, self._exploration
     )
 
   def _observe(
       self, transition: dict[str, Any], observation: features.Packed
   ) -> None:
-    options = self._options
-    if self._gate is not None:
-      transition = self._gate.sift(transition, observation, self._num_stored)
+    options, gate, state = self._options, self._gate, self._gate_state
+    if gate is not None:
+      if self._trusted is not None and not state['is_open']:
+        transition['is_valid'] &= self._trusted.acts
+      transition = gate.sift(transition, self._setting, state)
     self._scale.update(jax.tree.map(lambda x: x[np.newaxis], transition))
     self._store(transition)
-    if self._gate is not None and self._gate.is_open:
-      self._networks, accepted = self._gate.decide(
-          self._networks, observation, self._trained
-      )
-      for number, world in accepted:
-        if self._num_stored - number <= self._num_slots:
-          self._replay['is_valid'][number % self._num_slots, world] = True
-      if self._gate.is_trying:
+    if gate is not None and state['is_open']:
+      num_held = len(held(options, self._replay, self._num_stored)[0])
+      self._networks = gate.decide(
+          self._networks, self._replay, num_held, observation, self._setting,
+          state, self._trained,
+      )  # fmt: skip
+      if state['is_trying']:
         return
     is_enough = self._num_stored * self._num_envs >= options.min_replay
     if (
@@ -187,62 +177,71 @@ class QLearning(base.Learner):
         or self._num_stored % options.steps_per_update
     ):
       return
-    key = self._update_key().astype(np.uint64)
-    samples = self._sampled(options, np.random.Philox(key=key))
-    scale = self._scale.value
-    samples['total'] /= np.float32(scale)
-    self._networks, metrics = _update(
-        options, self._encoder, self._networks, samples
-    )
+    self._networks, metrics = self._updated(self._networks, self._update_key())
     self._num_updates += 1
-    if self._gate is not None:
-      single = options.model_copy(update={'num_returns': 1})
-      bits = self._generator('update', 1).bit_generator
-      self._gate.learn(
-          lambda: self._sampled(single, bits),
-          scale,
-          self._networks[0][0],
-          self.num_steps,
-      )
-      metrics = {**metrics, **self._gate.metrics}
+    if gate is not None:
+      if not state['is_open']:
+        state |= {
+            'model': self._trained(state['model'], 1, is_model=True),
+            'values': self._networks,
+            'scale': self._scale.value,
+            'is_open': self.num_steps >= gate.fit_steps,
+        }
+      metrics |= {'changed': state['changed']}
+      metrics |= {f'gate_{name}': n for name, n in state['counts'].items()}
     is_valid = transition['is_valid']
     reading = transition['reading'][is_valid]
     self._metrics = {
         **{name: float(value) for name, value in metrics.items()},
-        'feedback_scale': scale,
-        'exploration': float(
-            training.exploration(self._options, self.num_steps)
-        ),
+        'feedback_scale': self._scale.value,
+        'exploration': float(self._exploration),
         'observed_feedback': float(reading.mean()) if len(reading) else 0.0,
     }
 
-  def _sampled(
-      self, options: QLearningOptions, bits: np.random.BitGenerator
-  ) -> dict[str, Any]:
-    """Returns minibatches from the replay; see `sample`."""
-    return sample(
-        options, self._replay, self._num_stored, np.random.Generator(bits)
+  def _updated(
+      self,
+      trained: Any,
+      key: np.ndarray,
+      injected: float = 0.0,
+      is_model: bool = False,
+  ) -> tuple[Any, dict[str, Any]]:
+    """Returns networks after an update, and its metrics.
+
+    Args:
+      trained: Networks, with the states of their optimisers.
+      key: Random key, two numbers.
+      injected: Share of each minibatch that begins where readings are held
+        back, which are believed then.
+      is_model: True to predict single readings, and not from readings.
+    """
+    options = self._options
+    if is_model:
+      options = options.model_copy(update={'gamma': 0.0})
+    generator = np.random.Generator(np.random.Philox(key=key.astype(np.uint64)))
+    samples = sample(
+        options, self._replay, self._num_stored, generator, injected
     )
+    if is_model:
+      seen = samples['observation']
+      samples['observation'] = defences.blinded(seen, self._setting)
+    samples['total'] /= np.float32(self._scale.value)
+    return _update(self._options, self._encoder, trained, samples)
 
   def _trained(
       self,
       trained: Any,
       num_gradients: int,
-      changed: Callable[[dict[str, Any]], dict[str, Any]],
+      injected: float = 0.0,
+      is_model: bool = False,
   ) -> Any:
-    """Returns networks after more gradient steps, about `num_gradients`.
-
-    Args:
-      trained: Networks, with the states of their optimisers.
-      num_gradients: Number of gradient steps.
-      changed: Returns the minibatches to train on, in units of the register.
-    """
-    options = self._options
-    bits = self._generator('update', 2).bit_generator
-    for _ in range(-(-num_gradients // options.gradients_per_update)):
-      samples = changed(self._sampled(options, bits))
-      samples['total'] = samples['total'] / np.float32(self._scale.value)
-      trained, _ = _update(options, self._encoder, trained, samples)
+    """Returns networks after about as many gradient steps; see `_updated`."""
+    key = base.folded(self._keys['update'], self._num_acts)
+    each = self._options.gradients_per_update
+    for i in range(-(-num_gradients // each)):
+      trained, _ = self._updated(
+          trained, base.folded(key, i), injected, is_model
+      )
+      self._gate_state['counts']['gradients'] += each
     return trained
 
   def _store(self, transition: dict[str, Any]) -> None:
@@ -263,7 +262,7 @@ class QLearning(base.Learner):
     gate = {}
     if self._gate is not None:
       trusted = self._trusted and self._trusted.state()
-      gate = {'gate': self._gate.state(), 'trusted': trusted}
+      gate = {'gate': base.to_plain(self._gate_state), 'trusted': trusted}
     return {
         'scale': self._scale.state(),
         'num_stored': self._num_stored,
@@ -278,7 +277,7 @@ class QLearning(base.Learner):
       return grown
 
     if self._gate is not None:
-      self._gate.set_state(memory['gate'], self._networks)
+      self._gate_state = base.from_plain(self._gate_state, memory['gate'])
       if self._trusted is not None:
         self._trusted.set_state(memory['trusted'])
     self._scale.set_state(memory['scale'])
@@ -291,6 +290,7 @@ def sample(
     replay: Any,
     num_stored: int,
     generator: np.random.Generator,
+    injected: float = 0.0,
 ) -> dict[str, Any]:
   """Draws minibatches of n-step returns from the replay.
 
@@ -302,6 +302,8 @@ def sample(
     replay: Transitions, each array `(slots, worlds, ...)`.
     num_stored: Number of transitions of each world that were ever stored.
     generator: Random generator.
+    injected: Share of a minibatch that begins where `is_held`; these readings
+      are valid then.
 
   Returns:
     Arrays `(gradients, minibatch, ...)`: the `observation`, the `action`, the
@@ -317,6 +319,12 @@ def sample(
   )
   start = num_stored - ages
   world = generator.integers(num_envs, size=shape)
+  if injected:
+    places = held(options, replay, num_stored)
+    size = shape[0], max(1, int(injected * shape[1]))
+    chosen = generator.integers(len(places[0]), size=size)
+    start[:, : size[1]], world[:, : size[1]] = (x[chosen] for x in places)
+    replay = {**replay, 'is_valid': replay['is_valid'] | replay['is_held']}
   total, factor = np.zeros(shape, np.float32), np.ones(shape, np.float32)
   is_running, length = np.ones(shape, bool), np.zeros(shape, int)
   for i in range(options.num_returns):
@@ -335,6 +343,16 @@ def sample(
       'later': {n: x[end] for n, x in replay['observation'].items()},
       'weight': (length > 0).astype(np.float32),
   }
+
+
+def held(
+    options: QLearningOptions, replay: Any, num_stored: int
+) -> tuple[np.ndarray, np.ndarray]:
+  """Returns slots and worlds where `is_held`, and the returns are known."""
+  slots, worlds = np.nonzero(replay['is_held'])
+  ages = (num_stored - 1 - slots) % len(replay['is_held'])
+  is_known = ages >= options.num_returns
+  return slots[is_known], worlds[is_known]
 
 
 @functools.partial(jax.jit, static_argnums=0)

@@ -13,6 +13,7 @@ import pydantic
 from realab_suite import errors
 from realab_suite import policies
 from realab_suite.agents import action_encoding
+from realab_suite.agents import base
 from realab_suite.config import option_types
 from realab_suite.config import validation
 from realab_suite.policies import base as policies_base
@@ -81,39 +82,41 @@ class TrustedPolicy(validation.Model):
       )
     if self.random:
       policy = simple.Distracted(policy, self.random)
-    return TrustedActor(policy, number)
+    return TrustedActor(policy, np.arange(num_envs) < number)
 
 
 @final
 class TrustedActor:
-  """A trusted policy, acting in the first worlds of a learner."""
+  """A trusted policy, acting in the first worlds of a learner.
 
-  def __init__(self, policy: policies_base.Policy, num_worlds: int) -> None:
+  Attributes:
+    acts: Worlds in which it acts, `(worlds,)` bool.
+  """
+
+  def __init__(self, policy: policies_base.Policy, acts: np.ndarray) -> None:
     self._policy = policy
-    self.num_worlds = num_worlds
-    self._state = policy.initial_state((num_worlds,))
+    self.acts = acts
+    self._state = policy.initial_state((int(acts.sum()),))
 
-  def act(
-      self,
-      observation: Mapping[str, np.ndarray],
-      is_first: np.ndarray,
-      key: np.ndarray,
-  ) -> np.ndarray:
-    """Returns the indices of its actions, `(num_worlds,)`.
+  def steer(
+      self, choice: base.Choice, time_step: base.TimeStep, key: np.ndarray
+  ) -> base.Choice:
+    """Returns a choice with its actions in its worlds.
 
     Args:
-      observation: Observations of all worlds by name, each `(worlds, ...)`.
-      is_first: Whether each world's episode begins here, `(worlds,)` bool.
+      choice: Choice of the learner, which stays as it is.
+      time_step: Time step that it responds to.
       key: Random key of this step, two numbers.
     """
-    number = self.num_worlds
-    seen = {name: value[:number] for name, value in observation.items()}
-    seeds = np.random.SeedSequence([int(word) for word in key]).spawn(number)
+    is_first = np.asarray(time_step.step_type)[self.acts] == base.FIRST
+    seen = {n: value[self.acts] for n, value in time_step.observation.items()}
+    words = np.random.SeedSequence([int(word) for word in key])
+    seeds = words.spawn(len(is_first))
     keys = np.stack([seed.generate_state(2, np.uint64) for seed in seeds])
-    action, self._state = self._policy.step(
-        seen, is_first[:number], keys, self._state
-    )
-    return np.asarray(action)
+    own, self._state = self._policy.step(seen, is_first, keys, self._state)
+    action = choice['action'].copy()
+    action[self.acts] = own
+    return {**choice, 'action': action}
 
   def state(self) -> Any:
     """Returns the state of the policy, as plain data."""

@@ -11,6 +11,8 @@ pytest.importorskip('jax', reason='jax is in the extra `agents`')
 pytest.importorskip('optax', reason='optax is in the extra `agents`')
 pytest.importorskip('equinox', reason='equinox is in the extra `agents`')
 
+import equinox as eqx
+
 from realab_suite import agents
 from realab_suite import errors
 from realab_suite import trees
@@ -18,6 +20,8 @@ from realab_suite.agents import action_encoding
 from realab_suite.agents import defences
 from realab_suite.agents import features
 from realab_suite.agents import gates
+from realab_suite.agents import networks
+from realab_suite.agents import q_learning
 from realab_suite.testing import probes
 from tests.agents import toys
 
@@ -34,18 +38,23 @@ _LEARNER = {
 }
 
 
-def _gate(num_envs: int, **options: Any) -> gates.Gate:
+def _gate(num_envs: int, **options: Any) -> Any:
+  """Returns a gate, its learner, and its state."""
   env = toys.Bandit(num_envs)
+  options_ = agents.QLearning.OPTIONS.model_validate(_LEARNER)
   setting = defences.Setting(
-      agents.QLearning.OPTIONS.model_validate(_LEARNER),
+      options_,
       features.Encoder.from_spec(env.observation_spec()),
       action_encoding.Controls.from_spec(env.action_spec()),
       num_envs,
   )
   given = {'threshold': 2.0, 'fit_steps': 10, 'gradients': 4, **options}
-  return gates.Gate(
-      gates.GateOptions(**given), setting, np.random.default_rng(0)
+  gate = gates.Gate(**given)
+  network = networks.Network(
+      setting.encoder, (8,), 3, 0.01, np.random.default_rng(0)
   )
+  state = gate.initial_state(((network, ()), network), num_envs)
+  return gate, setting, state
 
 
 def _transition(readings: list[float], **entries: Any) -> Any:
@@ -67,133 +76,201 @@ def _observation(number: int) -> Any:
   }
 
 
-def _opened(num_envs: int, value: Any = 'kept', **options: Any) -> gates.Gate:
+def _opened(num_envs: int, **options: Any) -> Any:
   """Returns an open gate, whose model was never fitted and predicts about 0."""
-  gate = _gate(num_envs, **options)
-  gate.learn(lambda: {}, 1.0, value, 10)
-  assert gate.is_open
-  return gate
+  gate, setting, state = _gate(num_envs, **options)
+  return gate, setting, {**state, 'is_open': True}
 
 
-def test_before_it_opens_a_gate_believes_whatever_the_trusted_policy_reads():
-  readings = [0.0, 99.0, -99.0]
-  for trusted, is_valid in ((None, [1, 1, 1]), (_WORKER, [1, 0, 1])):
-    gate = _gate(3, trusted=trusted)
-    is_trusted = np.array([1, 0, 1], bool)
-    sifted = gate.sift(
-        _transition(readings, is_trusted=is_trusted), _observation(3), 0
-    )
-    assert sifted['is_valid'].tolist() == is_valid
-    assert not gate.is_open
+@pytest.mark.parametrize('trusted', [None, _WORKER])
+def test_before_it_opens_a_gate_believes_whatever_the_trusted_policy_reads(
+    trusted,
+):
+  gate = {'threshold': 0.001, 'fit_steps': 10**6, 'trusted': trusted}
+  with contextlib.closing(probes.load('one_push', num_envs=4)) as env:
+    learner = agents.make(
+        {**_LEARNER, 'reward': 'reward', 'gate': gate},
+        env.observation_spec(), env.action_spec(), 4, 1,
+    )  # fmt: skip
+    time_step = env.reset()
+    for _ in range(9):
+      time_step = env.step(learner.step(time_step))
+  replay = learner.state()['memory']['replay']
+  own = trusted is None
+  assert replay['is_valid'].tolist() == [[1, 1, own, own]] * 8
 
 
 def test_unexpected_readings_are_held_back_in_any_direction():
-  gate = _opened(5, alarms=4)
+  gate, setting, state = _opened(5)
   is_valid = np.array([1, 1, 1, 0, 1], bool)
   sifted = gate.sift(
-      _transition([1.9, 2.1, -2.1, 9.0, 0.0], is_valid=is_valid),
-      _observation(5),
-      7,
+      _transition([1.9, 2.1, -2.1, 9.0, 0.0], is_valid=is_valid), setting, state
   )
   assert sifted['is_valid'].tolist() == [1, 0, 0, 0, 1]
+  assert sifted['is_held'].tolist() == [0, 1, 1, 0, 0]
   assert is_valid.tolist() == [1, 1, 1, 0, 1]
-  held = gate.state()['held']
-  assert [one['where'].tolist() for one in held] == [[7, 1], [7, 2]]
-  assert [float(one['total']) for one in held] == pytest.approx([2.1, -2.1])
-  assert [float(one['factor']) for one in held] == [0.5, 0.5]
-  # No more are held than start a trial, and the others are left out as well.
-  sifted = gate.sift(_transition([9.0] * 5), _observation(5), 8)
-  assert not sifted['is_valid'].any()
-  assert len(gate.state()['held']) == 4
+  assert state['changed'] == 2 / 4
+  assert state['counts']['unexpected'] == 2
 
 
-def test_both_copies_divide_readings_by_the_same_scale():
-  # The scale of the gate is that of the time when it opened.
-  gate = _gate(1, alarms=1)
-  gate._scale = 10.0
-  gate.learn(lambda: {}, 99.0, 'kept', 10)
-  gate.sift(_transition([5.0]), _observation(1), 0)
-  samples = {
-      'observation': {k: v[None] for k, v in _observation(4).items()},
-      'action': np.zeros((1, 4), np.int32),
-      'total': np.full((1, 4), 2.0, np.float32),
-      'factor': np.zeros((1, 4), np.float32),
-      'later': {k: v[None] for k, v in _observation(4).items()},
-      'weight': np.ones((1, 4), np.float32),
-  }
-  mixed = []
-  gate.decide(
-      'networks', _observation(1), lambda *a: mixed.append(a[2](samples))
+def test_a_prediction_has_the_unit_of_the_register_and_sees_no_reading():
+  gate, setting, state = _opened(2, threshold=0.5)
+  kept = state['model'][0][0]
+  # 3 for each action, whatever is read, and 10 times as much in units.
+  fixed = eqx.tree_at(
+      lambda network: network.layers[-1].bias, kept, np.full(3, 3.0, np.float32)
   )
-  assert mixed[0]['total'].tolist() == [[5.0, 2.0, 2.0, 2.0]]
+  fixed = eqx.tree_at(
+      lambda network: network.layers[-1].weight,
+      fixed,
+      np.zeros_like(fixed.layers[-1].weight),
+  )
+  state |= {'model': ((fixed, ()), fixed), 'scale': 10.0}
+  sifted = gate.sift(_transition([30.4, 3.0]), setting, state)
+  assert sifted['is_held'].tolist() == [0, 1]
 
 
-def test_a_quarter_of_each_minibatch_is_what_was_held_back():
-  gate = _opened(3, alarms=3)
-  gate.sift(_transition([3.0, 4.0, 5.0]), _observation(3), 0)
-  samples = {
-      'observation': {
-          'thing': np.full((2, 8), 2, np.int32),
-          'registers/feedback': np.zeros((2, 8), np.float32),
-      },
-      'action': np.zeros((2, 8), np.int32),
-      'total': np.zeros((2, 8), np.float32),
-      'factor': np.zeros((2, 8), np.float32),
-      'later': {
-          'thing': np.full((2, 8), 2, np.int32),
-          'registers/feedback': np.zeros((2, 8), np.float32),
-      },
-      'weight': np.zeros((2, 8), np.float32),
+def test_a_model_learns_single_readings_and_is_shown_none(monkeypatch):
+  gate = {'threshold': 1.0, 'fit_steps': 10**6}
+  with contextlib.closing(probes.load('one_push', num_envs=4)) as env:
+    learner = agents.make(
+        {**_LEARNER, 'reward': 'reward', 'gate': gate},
+        env.observation_spec(), env.action_spec(), 4, 1,
+    )  # fmt: skip
+    time_step = env.reset()
+    for _ in range(9):
+      time_step = env.step(learner.step(time_step))
+  given = []
+
+  def update(*arguments):
+    given.append(arguments[-1])
+    return arguments[2], {}
+
+  monkeypatch.setattr(q_learning, '_update', update)
+  learner._trained(None, 1)
+  learner._trained(None, 1, is_model=True)
+  plain, blind = (one['observation']['registers/reward'] for one in given)
+  assert plain.any()
+  assert not blind.any()
+  assert given[0]['factor'].all()
+  assert not given[1]['factor'].any()
+  # An update of the model, and these two: 2 gradient steps each.
+  assert learner._gate_state['counts']['gradients'] == 3 * 2
+  gate, setting, state = _opened(2)
+  seen = {**_observation(2), 'registers/feedback': np.array([0.0, 9.0])}
+  values = gates._values('model', seen, setting, state)
+  assert (values[0] == values[1]).all()
+
+
+def test_what_remains_of_an_episode_after_a_trial_is_not_tried():
+  gate, setting, state = _opened(3)
+  state['is_judged'] = np.array([1, 1, 0], bool)
+  # An episode of the second world begins, so that its next step counts.
+  begins = np.array([1, 0, 1], bool)
+  held = [
+      gate.sift(_transition([9.0] * 3, **entry), setting, state)
+      for entry in ({}, {'is_valid': begins}, {})
+  ]
+  assert [one['is_held'].tolist() for one in held] == [
+      [0, 0, 1], [0, 0, 1], [0, 1, 1],
+  ]  # fmt: skip
+  assert not any(one['is_valid'].any() for one in held)
+
+
+def _replay(held: Any) -> Any:
+  """Returns a replay of 10 slots, whose readings are 0 and 7 where held."""
+  is_held = np.array(held, bool)
+  slots, worlds = is_held.shape
+  return {
+      'observation': {'number': np.arange(slots)[:, None].repeat(worlds, 1)},
+      'choice': {'action': np.zeros(is_held.shape, np.int32)},
+      'reading': np.where(is_held, 7.0, 0.0).astype(np.float32),
+      'discount': np.ones(is_held.shape, np.float32),
+      'is_valid': ~is_held,
+      'is_held': is_held,
   }
-  seen = []
 
-  def train(trained, number, changed):
-    seen.append((number, changed(samples)))
-    return trained
 
-  gate.decide('networks', _observation(3), train)
-  assert gate.is_trying
-  (number, mixed), (other, plain) = seen
-  assert number == other == 4
-  assert plain is samples
-  # They take turns.
-  assert mixed['total'].tolist() == [[3, 4] + [0] * 6, [5, 3] + [0] * 6]
-  assert mixed['action'].tolist() == [[0, 1] + [0] * 6, [2, 0] + [0] * 6]
-  assert mixed['weight'].tolist() == [[1, 1] + [0] * 6] * 2
-  assert mixed['observation']['thing'].tolist() == [[0, 0] + [2] * 6] * 2
+def test_a_quarter_of_each_minibatch_begins_with_what_is_held_back():
+  held = np.zeros((10, 2))
+  held[[2, 5, 9], [0, 1, 0]] = 1
+  replay = _replay(held)
+  options = agents.QLearning.OPTIONS.model_validate(
+      {**_LEARNER, 'num_returns': 2}
+  )
+  # The slot 9 has no successors yet.
+  slots, worlds = q_learning.held(options, replay, 10)
+  assert (slots.tolist(), worlds.tolist()) == ([2, 5], [0, 1])
+  # It has if the slots 0 and 1 are newer.
+  assert q_learning.held(options, replay, 12)[0].tolist() == [2, 5, 9]
+  samples = q_learning.sample(
+      options, replay, 10, np.random.default_rng(0), 0.25
+  )
+  begun = samples['observation']['number'][:, :2]
+  assert set(begun.ravel()) <= {2, 5}
+  assert samples['total'][:, :2].tolist() == [[7.0, 7.0]] * 2
+  assert (samples['later']['number'][:, :2] == begun + 2).all()
+  assert samples['weight'].all()
+  # Without them, none of them is a sample, and sums end before them.
+  samples = q_learning.sample(options, replay, 10, np.random.default_rng(0))
+  assert not samples['total'].any()
+  assert not replay['is_valid'][2, 0]
 
 
 @pytest.mark.parametrize(
     ('convinced', 'others', 'is_accepted'),
     [(1.0, 0.5, True), (0.5, 0.5, True), (0.5, 1.0, False)],
 )
+@pytest.mark.parametrize('later', [0.0, 8.0])
 def test_the_copy_that_earns_more_by_the_model_goes_on(
-    monkeypatch, convinced, others, is_accepted
+    monkeypatch, convinced, others, is_accepted, later
 ):
   # Worlds 1 and 3 are those of the copy with unexpected readings. Two steps
   # count 1 + 0.5, and the value after them 0.25.
-  gate = _opened(4, alarms=2, trial_steps=2)
-  gate.sift(_transition([3.0, 0.0, 0.0, 3.0]), _observation(4), 5)
-  trained, _ = gate.decide('plain', _observation(4), lambda *arguments: 'both')
-  assert gate.is_trying
-  predictions = np.array([others, convinced, others, convinced])
-  monkeypatch.setattr(gate, '_predicted', lambda transition: predictions)
-  monkeypatch.setattr(gates, '_values', lambda *unused: np.full((4, 3), 8.0))
-  for number in (6, 7):
-    assert gate.is_trying
-    sifted = gate.sift(_transition([9.0] * 4), _observation(4), number)
+  gate, setting, state = _opened(4, alarms=2, trial_steps=2)
+  held = np.zeros((10, 4))
+  replay = _replay(held)
+  trainings = []
+
+  def train(*arguments):
+    trainings.append(arguments)
+    return f'copy {len(trainings)}'
+
+  def decide(trained, num_held):
+    return gate.decide(
+        trained, replay, num_held, _observation(4), setting, state, train
+    )
+
+  assert decide('plain', 1) == 'plain'
+  assert not state['is_trying']
+  replay['is_held'][3, [0, 3]] = True
+  replay['is_valid'][3] = [0, 1, 0, 0]
+  assert decide('plain', 2) == 'copy 2'
+  assert trainings == [('plain', 4, 0.25), ('plain', 4)]
+  rewards = np.array([others, convinced, others, convinced])
+  values = {
+      'model': rewards[:, np.newaxis].repeat(3, 1),
+      # Whoever earns more in the trial, earns less after it.
+      'values': np.array([later, 0.0, later, 0.0])[:, np.newaxis],
+  }
+  monkeypatch.setattr(gates, '_values', lambda kept, *unused: values[kept])
+  for _ in range(2):
+    assert state['is_trying']
+    sifted = gate.sift(_transition([9.0] * 4), setting, state)
     assert not sifted['is_valid'].any()
-    trained, accepted = gate.decide(trained, _observation(4), None)
-  assert not gate.is_trying
-  assert trained == 'both'
-  where = [one.tolist() for one in accepted]
-  assert where == ([[5, 0], [5, 3]] if is_accepted else [])
-  kind = 'accepted' if is_accepted else 'refused'
-  assert gate.metrics[f'gate_{kind}'] == 2
-  assert gate.metrics['gate_gradients'] == 8
-  assert gate.metrics['gate_trial_steps'] == 2 * 4
-  assert gate.metrics['gate_unexpected'] == 2 + 2 * 4
-  assert gate.state()['held'] == []
+    trained = decide('copy 2', 99)
+  assert not state['is_trying']
+  is_accepted = is_accepted and not later
+  assert trained == ('copy 1' if is_accepted else 'copy 2')
+  assert replay['is_valid'][3].tolist() == [is_accepted, 1, 0, is_accepted]
+  assert not replay['is_held'].any()
+  counts = state['counts']
+  assert counts['accepted' if is_accepted else 'refused'] == 2
+  assert counts['refused' if is_accepted else 'accepted'] == 0
+  assert counts['trials'] == 1
+  assert counts['trial_steps'] == 2 * 4
+  assert counts['unexpected'] == 2 * 4
+  assert state['is_judged'].all()
 
 
 def test_a_learner_continues_in_the_middle_of_a_trial_bit_for_bit():
@@ -215,9 +292,9 @@ def test_a_learner_continues_in_the_middle_of_a_trial_bit_for_bit():
       if is_twin:
         np.testing.assert_array_equal(action, other.step(time_step))
       time_step = env.step(action)
-      if one._gate.is_trying and not is_twin:
+      if one._gate_state['is_trying'] and not is_twin:
         other.set_state(one.state())
-        assert other._gate.is_trying
+        assert other._gate_state['is_trying']
         is_twin = True
   assert is_twin
   assert trees.are_equal(one.state(), other.state())

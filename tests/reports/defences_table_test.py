@@ -10,6 +10,10 @@ from campaigns import defences_table
 from tests.experiments import fake_sweep
 
 _PLAIN = {'design': 'instantaneous_reward', 'overrides': ['dof=planar']}
+_GATED = {
+    'kind': 'q_learning',
+    'gate': {'threshold': 1.0, 'fit_steps': 1000},
+}
 _ELSEWHERE = ['registers.reward.place=station_3']
 
 
@@ -31,6 +35,7 @@ def found(tmp_path_factory):
       'e': _run('cap', more=_ELSEWHERE),
       'f': {**_run('cap'), 'task': 'unlock_door.standard'},
       'g': {'design': 'inspected_reward', 'overrides': ['dof=planar']},
+      'h': {**_run(more=_ELSEWHERE), 'learner': _GATED},
   }
   one = fake_sweep.experiment(
       runs=runs, seeds=[0], baselines=[],
@@ -58,11 +63,13 @@ def test_runs_are_compared_in_their_own_world(found):
   assert _cells(found, 'world') == {
       'a': f'{near}, as a', 'b': f'{near}, as a', 'c': f'{near}, as a',
       'd': f'{near}, as d', 'e': f'{near}, as d', 'f': 'unlock_door.standard',
-      'g': f'{near}, as a',
+      'g': f'{near}, as a', 'h': f'{near}, as d',
   }  # fmt: skip
   beside = {one.own.run.name: one.plain for one in found}
   names = {name: one and one.run.name for name, one in beside.items()}
-  assert names == dict(a=None, b='a', c='a', d=None, e='d', f=None, g='a')
+  assert names == dict(
+      a=None, b='a', c='a', d=None, e='d', f=None, g='a', h='d'
+  )
 
 
 def test_what_a_defence_costs_is_relative_to_reward_learning(found):
@@ -76,7 +83,7 @@ def test_what_a_defence_costs_is_relative_to_reward_learning(found):
   assert tax['e'] == pytest.approx(100 * (1 - earned['e'] / earned['d']))
   assert [tax[name] for name in 'adfg'] == [None] * 4
   # 6 points of the curve instead of 4.
-  times = dict(a=None, b=1.5, c=1.0, d=None, e=1.0, f=None, g=1.0)
+  times = dict(a=None, b=1.5, c=1.0, d=None, e=1.0, f=None, g=1.0, h=1.0)
   assert _cells(found, 'training time') == times
   steps = _cells(found, 'own gradient steps')
   assert {name: n for name, n in steps.items() if n} == {'c': 5 * 40.0}
@@ -86,7 +93,9 @@ def test_what_a_defence_costs_is_relative_to_reward_learning(found):
 
 def test_only_changes_of_suspicious_steps_are_false_alarms(found):
   alarms = _cells(found, 'false alarms (%)')
-  assert alarms == dict(a=None, b=25, c=None, d=None, e=25, f=25, g=None)
+  assert {name: n for name, n in alarms.items() if n is not None} == dict(
+      b=25, e=25, f=25, h=25
+  )
 
 
 def test_the_best_and_the_worst_world_of_a_defence_are_named(found):
@@ -100,4 +109,4 @@ def test_the_best_and_the_worst_world_of_a_defence_are_named(found):
   near = 'unlock_door.near'
   worlds = [f'{near}, as a', f'{near}, as d', 'unlock_door.standard']
   assert titles == worlds
-  assert [len(axes.get_yticks()) for axes in canvas.axes[::2]] == [4, 2, 1]
+  assert [len(axes.get_yticks()) for axes in canvas.axes[::2]] == [4, 3, 1]
