@@ -13,6 +13,9 @@ from pictures import notebooks
 from realab_suite import suite
 from realab_suite.evaluation import stakes
 from realab_suite.experiments import experiment_specs
+from realab_suite.experiments import jobs
+from realab_suite.feedback import objectives
+from realab_suite.feedback import specs
 from realab_suite.launchers import audit
 from tests import registries
 from tests.launchers import in_process
@@ -31,7 +34,7 @@ _PAGES = [
 _OTHER_FILES = frozenset({
     '/path/to/agent.py', 'agent.py', 'mine.py', 'mine.yaml', 'watched.yaml',
     '_test.py', 'agent/', 'experiment.yaml', 'summary.md', 'tables.md', 'logs/',
-    'tensorboard/',
+    'tensorboard/', 'calm.py', 'calm.yaml',
 })  # fmt: skip
 
 
@@ -83,10 +86,30 @@ def test_python_blocks_of_a_page_run_in_order(page, registries, capsys):
   if page == 'docs/defences.md':
     one_push, work = 'push' + ' work' * 9, 'work' + ' work' * 9
     assert printed == f'{one_push}\ntrue 9, off by 5.0 units\n{work}\n'
+    # While its defences are registered.
+    _check_the_experiment_with_a_defence_of_ones_own()
   if page == 'docs/attribution.md':
     assert printed == '1.0\n1.0\n'
   if page == 'docs/supervision.md':
     assert printed == '1 1 0.0\n3 3 3.0\n3 2 0.0\n'
+
+
+def _check_the_experiment_with_a_defence_of_ones_own():
+  page = (_ROOT / 'docs/defences.md').read_text()
+  [text] = re.findall(r'```yaml\n(schema: 1\n.*?)```', page, re.DOTALL)
+  experiment = experiment_specs.load(yaml.safe_load(text))
+  assert len(jobs.plan(experiment)) == 6
+  design = experiment.designs['calm']
+  assert design.objective.registers == {'reward': 1.0}
+  [command] = re.findall(r'^realab audit (.*?)\n[a-z]', page, re.DOTALL | re.M)
+  overrides = re.findall(r'--set=(?:"(.*?)"|(\S+))', command)
+  words = [quoted or plain for quoted, plain in overrides]
+  assert specs.load('instantaneous_reward', words) == design
+  praise = {'kind': 'praise', 'register_name': 'score', 'weight': 3.0}
+  paid, _ = objectives.of_learner(
+      specs.LearnerSpec(kind='policy_gradient', reward='reward', defence=praise)
+  )
+  assert paid.registers == {'reward': 1.0, 'score': 3.0}
 
 
 def test_the_commands_of_the_page_on_audits_are_accepted(monkeypatch):

@@ -134,7 +134,7 @@ class Learner(abc.ABC):
     return self._num_acts * self._num_envs
 
   @property
-  def most(self) -> float | None:
+  def largest_credit(self) -> float | None:
     """Largest sum of readings of an episode that it credits, or `None`."""
     return None
 

@@ -35,6 +35,7 @@ class Guard:
     self._defence, self._setting = defence, setting
     self._state = defence.initial_state(setting, generator)
     self._reads = {name: self._key_of(name) for name in defence.reads}
+    self._hidden = self._undeclared()
     self._metrics: dict[str, float] = {}
     self._trusted = None
     if defence.trusts is not None:
@@ -66,6 +67,20 @@ class Guard:
       )
     return key
 
+  def _undeclared(self) -> frozenset[str]:
+    """Returns the keys of readings that the defence does not get.
+
+    What it pays is judged by what it declares, so it can pay nothing else.
+    """
+    defence, reward = self._defence, self._setting.options.reward
+    if (paid := defence.pays(reward)) is None or defence.SEES_READINGS:
+      return frozenset()
+    names = self._setting.encoder.names
+    readings = {name for name in names if name.startswith('registers/')}
+    declared = {self._key_of(one) for one in (reward, *paid, *defence.reads)}
+    # A memory is made of readings.
+    return frozenset({*readings, features.MEMORY} - declared)
+
   def queries(self, choice: base.Choice) -> dict[str, np.ndarray]:
     """Returns the values of query registers by name, each `(worlds,)`."""
     return {name: choice['action'] for name in self._defence.queries}
@@ -95,9 +110,20 @@ class Guard:
       The batch, with `is_cloned`: the steps whose actions are to be cloned. If
       there are any, no step is valid.
     """
-    treated, state, metrics = self._defence.treat(
-        batch, self._setting, self._state, key
-    )
+    given, hidden = batch['observation'], self._hidden
+    seen = {name: x for name, x in given.items() if name not in hidden}
+    try:
+      treated, state, metrics = self._defence.treat(
+          {**batch, 'observation': seen}, self._setting, self._state, key
+      )
+    except KeyError as error:
+      if not hidden.intersection(error.args):
+        raise
+      raise errors.SpecError(
+          f'learner.defence {self._defence.kind!r}: takes {error} from the'
+          f' observation; allowed are {sorted(seen)}, and readings of'
+          ' registers that `reads` or `pays` names'
+      ) from error
     self._check(treated, batch)
     self._state = state
     is_own = batch['is_valid'] & ~batch['is_trusted']
@@ -111,7 +137,9 @@ class Guard:
     clones = trusts is not None and num_steps <= trusts.clone_steps
     is_trusted, is_valid = batch['is_trusted'], treated['is_valid']
     return {
-        **treated,
+        **batch,
+        'reading': treated['reading'],
+        'discount': treated['discount'],
         'is_cloned': batch['is_valid'] & is_trusted & clones,
         'is_valid': is_valid & ~is_trusted & (not clones),
     }
@@ -134,9 +162,9 @@ class Guard:
         )
 
   @property
-  def most(self) -> float | None:
+  def largest_credit(self) -> float | None:
     """Largest sum of rewards that an episode can earn, or `None`."""
-    return self._defence.most
+    return self._defence.largest_credit
 
   @property
   def metrics(self) -> Mapping[str, float]:

@@ -158,8 +158,8 @@ class PolicyGradient(on_policy.OnPolicyLearner):
     return np.where(np.asarray(time_step.step_type) == base.LAST, 0, discount)
 
   @property
-  def most(self) -> float | None:
-    return None if self._guard is None else self._guard.most
+  def largest_credit(self) -> float | None:
+    return None if self._guard is None else self._guard.largest_credit
 
   def _steered(
       self,

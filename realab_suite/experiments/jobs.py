@@ -21,6 +21,7 @@ from realab_suite.evaluation import results
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import recorded_data
 from realab_suite.experiments import storage
+from realab_suite.feedback import objectives
 from realab_suite.feedback import specs
 
 _SCHEMA = 1
@@ -228,8 +229,13 @@ def plan(
     only: Names of the runs to plan, as in `Job.run`; empty for all.
 
   Raises:
-    SpecError: If a run does not exist.
+    SpecError: If a run does not exist, or has a defence that is not registered:
+      its baselines could not be judged.
   """
+  for name, design in experiment.designs.items():
+    learner = {} if design.learner is None else design.learner.model_dump()
+    if reason := objectives.why_unknown(learner.get('defence')):
+      raise errors.SpecError(f'runs.{name}: learner {reason}')
   variants = [
       job
       for name, run in experiment.runs.items()

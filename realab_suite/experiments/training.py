@@ -288,7 +288,7 @@ class _Training:
         self._begin_segment()
         stack.callback(lambda: self._batch.close())
       learner = make_learner(job, self._recorded or self._batch)
-      _check_credit(job, learner.most, path.parent)
+      _check_credit(job, learner.largest_credit, path.parent)
       self._add_machine(learner, saved)
       if saved is None:
         time_step = (
@@ -497,24 +497,24 @@ class _LearnerActor:
 
 
 def _check_credit(
-    job: jobs.Job, most: float | None, output: pathlib.Path
+    job: jobs.Job, largest: float | None, output: pathlib.Path
 ) -> None:
   """Refuses a learner to which honest competence earns more than it credits.
 
   Args:
     job: The job.
-    most: Largest sum of readings that the learner credits, or `None`.
+    largest: Largest sum of readings that the learner credits, or `None`.
     output: Folder of the experiment.
 
   Raises:
     SpecError: If it is less than the stake of the design.
   """
-  if most is None:
+  if largest is None:
     return
   found = kept_stakes.stakes_of(job.experiment.world, job.design, output)
-  if found is not None and most < found.main.low:
+  if found is not None and largest < found.main.low:
     raise errors.SpecError(
-        f'learner.defence: credits {most:g} in an episode; honest competence'
+        f'learner.defence: credits {largest:g} in an episode; honest competence'
         f' earns {found.main.estimate:g} more than {found.main.than}; allowed'
         ' are larger sums'
     )

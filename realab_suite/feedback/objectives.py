@@ -139,6 +139,24 @@ def _approval_beside(options: _Options, reward: str) -> Payment:
   return Payment(weights, (_name(options, 'query', 'defence.'),))
 
 
+def why_unknown(defence: Any) -> str | None:
+  """Returns why nothing is known about a defence, or `None` if it is known.
+
+  Args:
+    defence: Options of the defence, or `None`.
+  """
+  if not isinstance(defence, Mapping):
+    return None
+  kind: Any = defence.get('kind')
+  if isinstance(kind, str) and (kind in PAYMENTS or kind in DEFENCES):
+    return None
+  return (
+      f'has the defence {messages.quote(kind)}, which is not registered; known'
+      f' are {sorted({*PAYMENTS, *DEFENCES})}, and --import names the module of'
+      ' another'
+  )
+
+
 def _payment(defence: Any, reward: str) -> Payment | str:
   """Returns the payment of a learner, or the reason why it is not known.
 
@@ -152,8 +170,8 @@ def _payment(defence: Any, reward: str) -> Payment | str:
   is_name = isinstance(kind, str)
   if is_name and kind in PAYMENTS:
     return PAYMENTS.get(kind)(defence, reward)
-  if not is_name or kind not in DEFENCES:
-    return f'has the defence {messages.quote(kind)}, which is not registered'
+  if unknown := why_unknown(defence):
+    return unknown
   one = validation.validate(DEFENCES.get(kind), defence, 'learner.defence')
   if (weights := one.pays(reward)) is None:
     return (

@@ -239,7 +239,8 @@ def load_imports() -> None:
     if not all(part.isidentifier() for part in name.split('.')):
       raise errors.SpecError(
           f'--import={name:.80}: not the name of a module; allowed are names'
-          ' such as my_registers or my_package.registers'
+          ' such as my_registers or my_package.registers; for several, repeat'
+          ' the option'
       )
     try:
       importlib.import_module(name)

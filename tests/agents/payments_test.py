@@ -3,6 +3,8 @@
 from collections.abc import Iterator, Mapping
 from typing import Any, Literal, final
 
+from dm_env import specs as dm_env_specs
+import numpy as np
 import pytest
 
 pytest.importorskip('jax', reason='jax is in the extra `agents`')
@@ -11,7 +13,10 @@ pytest.importorskip('equinox', reason='equinox is in the extra `agents`')
 
 from realab_suite import agents
 from realab_suite import errors
+from realab_suite.agents import action_encoding
 from realab_suite.agents import defences
+from realab_suite.agents import features
+from realab_suite.agents import guards
 from realab_suite.config import validation
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import verdicts
@@ -215,6 +220,132 @@ def test_pay_from_what_is_not_there_is_refused_at_load(defence, message):
   assert '\n' not in str(raised.value)
 
 
+@final
+class Listening(_Odd):
+  """Reads two registers, and pays from the reward alone."""
+
+  kind: Literal['listening'] = 'listening'
+
+  def pays(self, reward: str) -> Mapping[str, float]:
+    return {reward: 1.0}
+
+
+@final
+class Seeing(defences.Defence):
+  SEES_READINGS = True
+
+  kind: Literal['seeing'] = 'seeing'
+  is_clear: bool = False
+
+  def pays(self, reward: str) -> Mapping[str, float] | None:
+    return {reward: 1.0} if self.is_clear else super().pays(reward)
+
+  def treat(self, batch, setting, state, key):
+    return defences.Treated(batch, state)
+
+
+def _guard(defence: defences.Defence) -> tuple[guards.Guard, dict[str, Any]]:
+  """Returns a guard in an environment with four readings, and a batch."""
+  names = ('reward', 'gift', 'fine', 'bribe')
+  keys = [f'registers/{name}' for name in names]
+  reading = dm_env_specs.Array((), np.float64)
+  setting = defences.Setting(
+      agents.PolicyGradient.OPTIONS(kind='policy_gradient', reward='reward'),
+      features.Encoder.from_spec(
+          {'light': dm_env_specs.Array((2,), np.float64)}
+          | dict.fromkeys(keys, reading)
+      ),
+      action_encoding.Controls.from_spec(dm_env_specs.DiscreteArray(3)),
+      4,
+  )
+  values = {
+      key: np.full((5, 4), i + 1.0, np.float32) for i, key in enumerate(keys)
+  }
+  batch = {
+      'observation': {
+          **values,
+          'light': np.ones((5, 4, 2), np.float32),
+          features.MEMORY: np.ones((5, 4, 8), np.float32),
+      },
+      'choice': {'action': np.zeros((5, 4), np.int32)},
+      'reading': np.full((5, 4), 9.0, np.float32),
+      'discount': np.ones((5, 4), np.float32),
+      'is_valid': np.ones((5, 4), bool),
+      'is_trusted': np.zeros((5, 4), bool),
+      'readings': {},
+  }
+  return guards.Guard(defence, setting, np.random.default_rng(0)), batch
+
+
+_EVERY = {'light', 'reward', 'gift', 'fine', 'bribe', 'learner/memory'}
+
+
+@pytest.mark.parametrize(
+    ('defence', 'missing'),
+    [
+        (Deaf(), {'gift', 'fine', 'bribe', 'learner/memory'}),
+        (Listening(), {'bribe', 'learner/memory'}),
+        (Paying(cost='bribe'), {'fine', 'learner/memory'}),
+        (Replacing(cost='bribe', bonus='gift'), {'fine', 'learner/memory'}),
+        # They are not judged, so nothing has to be hidden.
+        (Silent(), set()),
+        (Seeing(), set()),
+        (Seeing(is_clear=True), set()),
+    ],
+)
+def test_a_defence_gets_only_the_readings_that_it_declares(
+    monkeypatch, defence, missing
+):
+  guard, batch = _guard(defence)
+  found = []
+
+  def treat(self, given, setting, state, key):
+    found.append((set(given['observation']), defences.data_of(given, setting)))
+    return defences.Treated(
+        {**given, 'reading': given['reading'] - 1, 'choice': {}}, state
+    )
+
+  monkeypatch.setattr(type(defence), 'treat', treat)
+  learned = guard.treat(batch, 0, np.array([1, 2], np.uint32))
+  [(keys, data)] = found
+  assert {key.removeprefix('registers/') for key in keys} == _EVERY - missing
+  # Light, four readings, and the action: arcsinh of what is given, or 0.
+  given = [
+      0.0 if name in missing else np.arcsinh(i + 1.0)
+      for i, name in enumerate(('reward', 'gift', 'fine', 'bribe'))
+  ]
+  np.testing.assert_allclose(
+      data['vector'][3, 1], [1.0, 1.0, *given, 1.0, 0.0, 0.0], rtol=1e-6
+  )
+  # The learner sees all of it, and only its rewards are others.
+  assert learned['observation'] is batch['observation']
+  assert learned['choice'] is batch['choice']
+  assert (learned['reading'] == 8.0).all()
+
+
+@pytest.mark.parametrize(
+    ('key', 'error'),
+    [('registers/gift', errors.SpecError), ('registers/none', KeyError)],
+)
+def test_a_reading_that_a_defence_does_not_declare_is_refused(
+    monkeypatch, key, error
+):
+  guard, batch = _guard(Deaf())
+
+  def treat(self, given, setting, state, number):
+    reading = given['reading'] + given['observation'][key]
+    return defences.Treated({**given, 'reading': reading}, state)
+
+  monkeypatch.setattr(Deaf, 'treat', treat)
+  with pytest.raises(error, match=key) as raised:
+    guard.treat(batch, 0, np.array([1, 2], np.uint32))
+  if error is errors.SpecError:
+    text = str(raised.value)
+    assert text.startswith("learner.defence 'deaf': takes 'registers/gift'")
+    assert "allowed are ['light', 'registers/reward']" in text
+    assert '\n' not in text
+
+
 _SHIPPED = {
     'alarm': {'register': 'bell'},
     'cap': {},
@@ -231,6 +362,7 @@ def test_every_defence_of_this_package_declares_its_pay():
   for kind, options in _SHIPPED.items():
     spec = {'kind': kind, **options}
     one = validation.validate(defences.DEFENCES.get(kind), spec, 'defence')
+    assert one.SEES_READINGS == (kind == 'orpo')
     paid = one.pays('coins')
     assert paid['coins'] == 1.0
     # What it reads and does not pay from, it only listens to.

@@ -19,7 +19,7 @@ from realab_suite.launchers import train
 class FakeLearner:
   """Acts on a blend of all that it has seen."""
 
-  most = None
+  largest_credit = None
 
   def __init__(self, spec: Any, action_spec: Any, num_envs: int, seed: int):
     options = spec.model_extra or {}

@@ -223,6 +223,28 @@ def test_calibration_needs_calibration_seeds(tmp_path):
   assert not (tmp_path / 'new').exists()
 
 
+def test_a_defence_that_no_module_registers_is_refused_before_baselines(
+    tmp_path,
+):
+  # Their episodes would be kept, and have no objective to be judged by.
+  learner = {'kind': 'policy_gradient', 'defence': {'kind': 'armour'}}
+  runs = {**_SMALL['runs'], 'own': {**_SMALL['runs']['good']}}
+  runs['own']['learner'] = learner
+  one = {**_SMALL, 'runs': runs, 'baselines': ['apple_seeker']}
+  for attempt in (
+      lambda: _sweep(one, tmp_path / 'new', Pretender()),
+      lambda: jobs.plan(experiment_specs.load(one), [3], ['good']),
+  ):
+    with pytest.raises(
+        errors.SpecError, match=r"runs\.own: learner has the defence 'armour'"
+    ) as raised:
+      attempt()
+    assert 'known are' in str(raised.value)
+    assert '--import' in str(raised.value)
+    assert '\n' not in str(raised.value)
+  assert not (tmp_path / 'new').exists()
+
+
 @pytest.mark.usefixtures('no_wait')
 def test_seeds_may_be_added_and_other_changes_are_refused(tmp_path):
   _sweep(_SMALL, tmp_path, Pretender())

@@ -167,12 +167,14 @@ def test_rows_have_the_stakes_of_the_design_which_are_measured_once(
   assert len(keys) == 2
 
 
-@pytest.mark.parametrize(('most', 'is_refused'), [(1.0, True), (40.0, False)])
+@pytest.mark.parametrize(
+    ('largest', 'is_refused'), [(1.0, True), (40.0, False)]
+)
 def test_a_learner_that_credits_less_than_honesty_earns_is_refused(
-    tmp_path, monkeypatch, most, is_refused
+    tmp_path, monkeypatch, largest, is_refused
 ):
   # In 17 control steps, the solver eats a few apples.
-  monkeypatch.setattr(fake_learner.FakeLearner, 'most', most)
+  monkeypatch.setattr(fake_learner.FakeLearner, 'largest_credit', largest)
   job = _job()
   if not is_refused:
     _run(job, tmp_path)

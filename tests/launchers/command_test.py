@@ -148,12 +148,15 @@ def test_a_number_out_of_range_is_refused_when_flags_are_parsed(argument):
     absl_flags.FLAGS(['program', argument])
 
 
-@pytest.mark.parametrize('name', ['', '.mine', 'a..b', 'a b', 'a/b', '1a'])
+@pytest.mark.parametrize(
+    'name', ['', '.mine', 'a..b', 'a b', 'a/b', '1a', 'a,b']
+)
 def test_wrong_names_of_modules_are_refused(name):
   with flagsaver.flagsaver():
     absl_flags.FLAGS(['program', f'--import={name}'])
-    with pytest.raises(errors.SpecError, match='not the name of a module'):
+    with pytest.raises(errors.SpecError, match='not the name of a module') as e:
       flags.load_imports()
+    assert str(e.value).endswith('for several, repeat the option')
 
 
 def test_every_launcher_imports_the_user_s_module(tmp_path):

@@ -73,6 +73,9 @@ class Defence(validation.Model):
 
   # True if it changes suspicious steps alone, so that each change is an alarm.
   ALARMS: ClassVar[bool] = False
+  # True if it gets the readings of all registers in `observation`. Otherwise it
+  # gets those that it reads or pays from, so that no others can be paid.
+  SEES_READINGS: ClassVar[bool] = False
 
   kind: str
 
@@ -93,12 +96,12 @@ class Defence(validation.Model):
     Returns:
       Weights by name; `None` if no sum of readings is paid, and nothing can be
       said about tampering. The default is the reward alone, or `None` for a
-      defence that reads further registers, because it may pay from them.
+      defence that gets further readings, because it may pay from them.
     """
     if self.kind in objectives.PAYMENTS:
       paid = objectives.PAYMENTS.get(self.kind)(self.model_dump(), reward)
       return None if isinstance(paid, str) else paid.registers
-    return None if self.reads else {reward: 1.0}
+    return None if self.reads or self.SEES_READINGS else {reward: 1.0}
 
   @property
   def queries(self) -> tuple[str, ...]:
@@ -114,7 +117,7 @@ class Defence(validation.Model):
     return None
 
   @property
-  def most(self) -> float | None:
+  def largest_credit(self) -> float | None:
     """Largest sum of rewards that an episode can earn; `None` for any sum."""
     return None
 
@@ -149,10 +152,11 @@ class Defence(validation.Model):
 
     Args:
       batch: Transitions, each array `(time, worlds, ...)`: `observation`
-        (packed, see `features.Encoder.pack`) and `choice` with the `action`;
-        `reading`, `discount` and `is_valid` of the step after it, and
-        `readings` of the registers in `reads`, by name. `is_trusted`, `(time,
-        worlds)` bool, is True where the trusted policy has acted.
+        (packed, see `features.Encoder.pack`, without undeclared readings) and
+        `choice` with the `action`; `reading`, `discount` and `is_valid` of the
+        step after it, and `readings` of the registers in `reads`, by name.
+        `is_valid` is False in the step between two episodes. `is_trusted`,
+        `(time, worlds)` bool, is True where the trusted policy has acted.
       setting: What the defence knows of its learner.
       state: State that `initial_state` or the last call returned.
       key: Random key of this batch, two numbers.
@@ -187,9 +191,12 @@ def data_of(
 
   Returns:
     `vector` and images; actions are the last elements of `vector`, one-hot or
-    as they are.
+    as they are. Readings that a defence does not get are 0.
   """
-  observation = batch['observation']
+  given, lead = batch['observation'], np.shape(batch['choice']['action'])
+  missing = [e for e in setting.encoder.entries if e.name not in given]
+  zeros = {e.name: np.zeros((*lead[:2], *e.shape), np.float32) for e in missing}
+  observation = {**zeros, **given}
   if not with_readings:
     observation = blinded(observation, setting)
   encoded = dict(setting.encoder.encode(observation))

@@ -49,7 +49,7 @@ class Cap(base.Defence):
     return self
 
   @property
-  def most(self) -> float | None:
+  def largest_credit(self) -> float | None:
     return self.total
 
   def initial_state(

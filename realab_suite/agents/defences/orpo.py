@@ -43,6 +43,8 @@ class Orpo(base.Defence):
     of: `state_action`, or `state` for the ratio of observations alone.
   """
 
+  SEES_READINGS = True
+
   kind: Literal['orpo']
   trusted: trusted_policies.TrustedPolicy
   weight: Annotated[float, pydantic.Field(gt=0, le=1e6)] = 0.1
