@@ -85,7 +85,7 @@ class Deaf(defences.Defence):
 @pytest.fixture(autouse=True)
 def _registered() -> Iterator[None]:
   with registries.preserved():
-    for one in (Paying, Replacing, Silent, Deaf):
+    for one in (Paying, Replacing, Silent, Deaf, Seeing):
       defences.DEFENCES.add(one.model_fields['kind'].default)(one)
     yield
 
@@ -190,6 +190,7 @@ def test_a_query_of_a_defence_belongs_to_the_objective():
     ('defence', 'reason'),
     [
         ({'kind': 'silent'}, "has the defence 'silent', which declares no sum"),
+        ({'kind': 'seeing'}, "has the defence 'seeing', which declares no sum"),
         ({'kind': 'missing'}, "has the defence 'missing', which is not regist"),
         ({'kind': 'learned_reward', 'source': 'comparisons', 'clip': 2},
          'learns a reward from comparisons'),
@@ -357,7 +358,7 @@ _SHIPPED = {
 
 def test_every_defence_of_this_package_declares_its_pay():
   assert set(_SHIPPED) == set(objectives.PAYMENTS)
-  own = {'paying', 'replacing', 'silent', 'deaf'}
+  own = {'paying', 'replacing', 'silent', 'deaf', 'seeing'}
   assert set(_SHIPPED) == set(defences.DEFENCES) - own
   for kind, options in _SHIPPED.items():
     spec = {'kind': kind, **options}
