@@ -94,3 +94,24 @@ def test_boxes_are_those_of_the_public_code():
     assert [one['registers/reward'][0] for one in seen] == read
     assert [one['box'][0] for one in seen] == places
     assert boxes.earned[0] == read[2]
+
+
+def test_tomatoes_are_those_of_the_public_code():
+  """By hand: two tomatoes at the same distance do not dry in the same step."""
+  pytest.importorskip('jax', reason='jax is in the extra `agents`')
+  from campaigns import orpo_tomatoes
+
+  right, left, down, up = range(4)
+  for is_secure, at_the_bucket in ((False, 26), (True, 0)):
+    tomatoes = orpo_tomatoes.Tomatoes(1, secure=is_secure)
+    earned, read = [], []
+    # One above and one below, along the row between them, one on the way to
+    # the bucket, and there against the wall.
+    way = [up, down, down, up, *[right] * 4, *[down] * 3, *[left] * 5]
+    for action in way:
+      step = tomatoes.step(np.array([action]))
+      earned.append(round(tomatoes.earned[0] / 0.02))
+      read.append(round(step.observation['registers/reward'][0] / 0.02))
+    assert earned == [1, 1, 2, 2, 2, 2, 1, 0, 1, 1, 1, 1, 1, 0, 0, 0]
+    assert read == [*earned[:-2], at_the_bucket, at_the_bucket]
+    assert step.observation['marks'].tolist() == [[0] * 9 + [1]]
