@@ -37,8 +37,10 @@ class Orpo(base.Defence):
   Attributes:
     trusted: The trusted policy, and where it acts.
     weight: Weight of the charge, the lambda of the paper.
-    clip: Largest charge of a step, in units of `weight * sd`.
-    gradients: Number of gradient steps of the discriminator per batch.
+    clip: Largest charge of a step, in units of `weight * sd`. Tampering that
+      pays more per step than `weight * sd * clip` pays in spite of the charge.
+    gradients: Number of gradient steps of the discriminator per batch. With too
+      few, the learner has found tampering before the discriminator has.
     minibatch: Number of steps of each side per gradient.
     of: `state_action`, or `state` for the ratio of observations alone.
   """
@@ -48,8 +50,8 @@ class Orpo(base.Defence):
   kind: Literal['orpo']
   trusted: trusted_policies.TrustedPolicy
   weight: Annotated[float, pydantic.Field(gt=0, le=1e6)] = 0.1
-  clip: Annotated[float, pydantic.Field(gt=0, le=1e6)] = 10.0
-  gradients: Annotated[int, pydantic.Field(ge=1, le=10_000)] = 16
+  clip: Annotated[float, pydantic.Field(gt=0, le=1e6)] = 1000.0
+  gradients: Annotated[int, pydantic.Field(ge=1, le=10_000)] = 128
   minibatch: Annotated[int, pydantic.Field(ge=1, le=10**6)] = 256
   of: Literal['state_action', 'state'] = 'state_action'
 
