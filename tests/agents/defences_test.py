@@ -107,8 +107,10 @@ def test_mona_ends_returns_after_each_piece_and_adds_approval():
   assert batch['discount'].tolist() == [[1]] * 4
 
 
-@pytest.mark.parametrize('response', ['screen', 'penalty'])
-def test_an_alarm_leaves_steps_out_or_charges_them(response):
+@pytest.mark.parametrize(
+    ('response', 'paid'), [('screen', 4), ('penalty', 1), ('fine', -3)]
+)
+def test_an_alarm_leaves_steps_out_or_charges_them(response, paid):
   # The second step of world 0 has a reading above the threshold, that of
   # world 1 equals it, and the third is the ignored action of a new episode.
   alarm = np.array([[0, 0], [0.6, 0.5], [9, 0]], np.float32)
@@ -122,7 +124,7 @@ def test_an_alarm_leaves_steps_out_or_charges_them(response):
     assert treated['reading'].tolist() == [[4, 4]] * 3
   else:
     assert treated['is_valid'].tolist() == is_valid.tolist()
-    assert treated['reading'].tolist() == [[4, 4], [1, 4], [4, 4]]
+    assert treated['reading'].tolist() == [[4, 4], [paid, 4], [4, 4]]
 
 
 def test_orpo_charges_the_ratio_of_occupancies():

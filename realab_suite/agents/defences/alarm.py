@@ -17,8 +17,9 @@ class Alarm(base.Defence):
     register_name: Name of the register; `register` in a file.
     above: A larger reading is an alarm.
     response: `screen` to leave the step out of the batch; `penalty` to learn
-      from a smaller reward.
-    penalty: What is subtracted from the reward.
+      from a smaller reward; `fine` to learn from a negative reward instead, so
+      that a small one does for any gain of the steps with an alarm.
+    penalty: What is subtracted from the reward, or its size instead.
   """
 
   ALARMS = True
@@ -26,7 +27,7 @@ class Alarm(base.Defence):
   kind: Literal['alarm']
   register_name: str = pydantic.Field(alias='register')
   above: Annotated[float, pydantic.Field(ge=-1e9, le=1e9)] = 0.5
-  response: Literal['screen', 'penalty'] = 'screen'
+  response: Literal['screen', 'penalty', 'fine'] = 'screen'
   penalty: Annotated[float, pydantic.Field(ge=0, le=1e6)] = 1.0
 
   @property
@@ -43,9 +44,11 @@ class Alarm(base.Defence):
     del setting, key
     is_alarm = batch['readings'][self.register_name] > self.above
     is_alarm &= batch['is_valid']
-    if self.response == 'penalty':
-      reading = batch['reading'] - self.penalty * is_alarm
-      treated = {**batch, 'reading': reading.astype(np.float32)}
-    else:
-      treated = {**batch, 'is_valid': batch['is_valid'] & ~is_alarm}
+    if self.response == 'screen':
+      is_valid = batch['is_valid'] & ~is_alarm
+      return base.Treated({**batch, 'is_valid': is_valid}, state)
+    reading = batch['reading']
+    rest = reading if self.response == 'penalty' else 0.0
+    reading = np.where(is_alarm, rest - self.penalty, reading)
+    treated = {**batch, 'reading': reading.astype(np.float32)}
     return base.Treated(treated, state)
