@@ -109,12 +109,13 @@ def entries(folder: pathlib.Path) -> list[Entry]:
 
   beside: dict[str, sweep_results.Run | None] = {}
   for run in runs:
+    kind = run.design.learner.kind
     same = [
-        (_common(run, one), -i)
+        (_common(run, one), one.design.learner.kind == kind, -i)
         for i, one in enumerate(runs)
         if _is_plain(one) and _common(run, one)
     ]
-    beside[run.name] = runs[-max(same)[1]] if same else None
+    beside[run.name] = runs[-max(same)[-1]] if same else None
   found = []
   for run in runs:
     plain, world = beside[run.name], run.config['task']
@@ -154,6 +155,8 @@ def _false_alarms(one: Entry) -> float | None:
       for points in one.twin.run.curves.values()
       for point in points[-max(1, len(points) // 10) :]
       if 'changed' in point['learner']
+      # A gate that has not opened has changed nothing.
+      and point['learner'].get('gate_is_open', True)
   ]
   return 100.0 * float(np.mean(shares)) if shares else None
 
@@ -170,12 +173,17 @@ def _seconds(one: numbers.Figures) -> float | None:
 def _gradients(one: Entry) -> float | None:
   """Returns the number of gradient steps that a learner alone does not take."""
   found: list[float] = []
+  defence: Any = _defence(one.own.run)
   for points in one.own.run.curves.values():
     last = points[-1]['learner']
     if 'gate_gradients' in last:
       found.append(last['gate_gradients'])
-    elif each := getattr(_defence(one.own.run), 'gradients', None):
-      found.append(each * last.get('num_updates', np.nan))
+    elif each := getattr(defence, 'gradients', None):
+      updates = last.get('num_updates', np.nan)
+      if getattr(defence, 'refit', None) == 'never':
+        # Its model is kept from then on.
+        updates *= min(1.0, defence.fit_steps / points[-1]['step'])
+      found.append(each * updates)
   return float(np.mean(found)) if found else None
 
 
@@ -232,8 +240,9 @@ def worlds(found: Sequence[Entry]) -> list[list[tables.Figure]]:
   """Returns the best and the worst world of each defence, with a header."""
   rows: dict[tuple[str, str], list[Entry]] = {}
   for one in found:
-    given = _learner(one.own.run).get('defence') or {}
-    kind = str(given.get('kind', tables.NOTHING))
+    given = _learner(one.own.run)
+    kind = 'gate' if given.get('gate') else tables.NOTHING
+    kind = str((given.get('defence') or {}).get('kind', kind))
     rows.setdefault((one.own.run.design.name, kind), []).append(one)
   table: list[list[tables.Figure]] = [list(_WORLDS)]
   for names, of_defence in rows.items():

@@ -275,11 +275,12 @@ class Learner(abc.ABC):
 
   def metrics(self) -> dict[str, float]:
     """Returns metrics of the last update, from observed feedback only."""
-    return {
+    counts = {
         'num_steps': float(self.num_steps),
         'num_updates': float(self._num_updates),
-        **self._metrics,
     }
+    # Names that a defence gives to its metrics do not replace these.
+    return {**counts, **self._metrics, **counts}
 
   @jax_settings.pinned()
   def state(self) -> dict[str, Any]:

@@ -86,14 +86,14 @@ class Gate(validation.Model):
     action = transition['choice']['action'][:, np.newaxis]
     predicted = np.take_along_axis(values, action, axis=1)[:, 0]
     error = np.abs(transition['reading'] - predicted)
-    is_alarm = is_valid & (error > self.threshold) & state['is_open']
+    is_alarm = is_valid & ~(error <= self.threshold) & state['is_open']
     state['changed'] = is_alarm.sum() / max(1, is_valid.sum())
     counts['unexpected'] += is_alarm.sum()
     # What follows in an episode says little without what was decided about.
     state['is_judged'] = state['is_judged'] & is_valid
     is_held = is_alarm & ~state['is_judged']
     if state['is_trying']:
-      earned = setting.options.gamma ** state['num_tried'] * predicted
+      earned = setting.options.gamma ** int(state['num_tried']) * predicted
       state['scores'] = state['scores'] + np.where(is_valid, earned, 0.0)
       state['num_tried'] += 1
       counts['trial_steps'] += len(is_valid)
@@ -132,7 +132,7 @@ class Gate(validation.Model):
       return trained
     later = _values('values', observation, setting, state).max(axis=-1)
     scores = state['scores'] + setting.options.gamma**self.trial_steps * later
-    is_worse = scores[1::2].mean() < scores[::2].mean()
+    is_worse = not scores[1::2].mean() >= scores[::2].mean()
     decision = 'refused' if is_worse else 'accepted'
     state['counts'][decision] += replay['is_held'].sum()
     replay['is_valid'] |= replay['is_held'] & (not is_worse)

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, final
 
+import jax
 import numpy as np
 
 from realab_suite import errors
@@ -112,9 +113,10 @@ class Guard:
     """
     given, hidden = batch['observation'], self._hidden
     seen = {name: x for name, x in given.items() if name not in hidden}
+    shown = jax.tree.map(_read_only, {**batch, 'observation': seen})
     try:
       treated, state, metrics = self._defence.treat(
-          {**batch, 'observation': seen}, self._setting, self._state, key
+          shown, self._setting, self._state, key
       )
     except KeyError as error:
       if not hidden.intersection(error.args):
@@ -128,6 +130,7 @@ class Guard:
     self._state = state
     is_own = batch['is_valid'] & ~batch['is_trusted']
     is_same = np.isclose(treated['reading'], batch['reading'], atol=1e-6)
+    is_same &= treated['discount'] == batch['discount']
     is_changed = ~(is_same & treated['is_valid'])[is_own]
     self._metrics = {
         **{name: float(value) for name, value in metrics.items()},
@@ -141,7 +144,7 @@ class Guard:
         'reading': treated['reading'],
         'discount': treated['discount'],
         'is_cloned': batch['is_valid'] & is_trusted & clones,
-        'is_valid': is_valid & ~is_trusted & (not clones),
+        'is_valid': is_valid & batch['is_valid'] & ~is_trusted & (not clones),
     }
 
   def _check(self, treated: dict[str, Any], batch: dict[str, Any]) -> None:
@@ -151,14 +154,24 @@ class Guard:
       SpecError: If an entry is missing, or has another shape or numbers that
         are not finite.
     """
-    for name in ('reading', 'discount', 'is_valid'):
+    for name, kinds, most, allowed in (
+        ('reading', 'iuf', np.finfo(np.float32).max, 'finite numbers'),
+        ('discount', 'iuf', 1.0, 'numbers from 0 to 1'),
+        ('is_valid', 'b', 1.0, 'booleans'),
+    ):
       value = np.asarray(treated.get(name))
       shape = batch[name].shape
-      if value.shape != shape or not np.isfinite(value.astype(float)).all():
+      is_fine = value.shape == shape and value.dtype.kind in kinds
+      # A comparison with NaN is False.
+      if is_fine and not (np.abs(value) <= most).all():
+        is_fine = False
+      if name == 'discount' and is_fine:
+        is_fine = bool((value >= 0).all())
+      if not is_fine:
         raise errors.SpecError(
             f'learner.defence {self._defence.kind!r}: treat returned {name!r}'
-            f' of the shape {value.shape}; allowed are finite numbers of the'
-            f' shape {shape}'
+            f' of the shape {value.shape} and dtype {value.dtype}; allowed are'
+            f' {allowed} of the shape {shape}'
         )
 
   @property
@@ -191,3 +204,10 @@ class Guard:
     self._state = base.from_plain(self._state, state['defence'])
     if self._trusted is not None:
       self._trusted.set_state(state['trusted'])
+
+
+def _read_only(array: Any) -> np.ndarray:
+  """Returns a view that a defence cannot change."""
+  view = np.asarray(array).view()
+  view.flags.writeable = False
+  return view

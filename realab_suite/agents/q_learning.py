@@ -109,6 +109,11 @@ class QLearning(base.Learner):
             self._encoder.names,
             'learner.gate',
         )
+      if gate.fit_steps <= options.min_replay:
+        raise errors.SpecError(
+            f'learner.gate.fit_steps: {gate.fit_steps}; allowed are more than'
+            f' min_replay, {options.min_replay}, before which nothing is fitted'
+        )
 
   @property
   def _exploration(self) -> np.float32:
@@ -187,7 +192,7 @@ class QLearning(base.Learner):
             'scale': self._scale.value,
             'is_open': self.num_steps >= gate.fit_steps,
         }
-      metrics |= {'changed': state['changed']}
+      metrics |= {'changed': state['changed'], 'gate_is_open': state['is_open']}
       metrics |= {f'gate_{name}': n for name, n in state['counts'].items()}
     is_valid = transition['is_valid']
     reading = transition['reading'][is_valid]

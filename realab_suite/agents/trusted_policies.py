@@ -74,7 +74,8 @@ class TrustedPolicy(validation.Model):
     needed = (*policy.required_senses, *policy.privileged_senses)
     senses = [name.removeprefix('senses/') for name in observed]
     policies.check_senses(where, needed, senses, 'observed')
-    number = int(np.ceil(self.worlds * num_envs))
+    # In floating point, 0.07 * 100 is more than 7.
+    number = int(np.ceil(np.round(self.worlds * num_envs, 6)))
     if number == num_envs:
       raise errors.SpecError(
           f'{owner}.trusted.worlds: {self.worlds:g}, all of {num_envs}'

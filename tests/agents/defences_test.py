@@ -19,6 +19,8 @@ from realab_suite import trees
 from realab_suite.agents import action_encoding
 from realab_suite.agents import defences
 from realab_suite.agents import features
+from realab_suite.agents import guards
+from realab_suite.agents import trusted_policies
 from realab_suite.config import validation
 from realab_suite.feedback import objectives
 from realab_suite.feedback import specs
@@ -289,6 +291,80 @@ def test_an_option_of_another_defence_does_not_remove_the_objective():
       spec = specs.LearnerSpec(kind='policy_gradient', **learner)
       found, _ = objectives.of_learner(spec)
       assert (found is not None) == is_judged
+
+
+@final
+class _Own(defences.Defence):
+  kind: Literal['own'] = 'own'
+  change: Any
+
+  def treat(self, batch, setting, state, key):
+    del setting, key
+    return defences.Treated({**batch, **self.change(batch)}, state)
+
+
+def _guarded(change: Any, batch: Any) -> Any:
+  setting = _setting(batch['reading'].shape[1])
+  guard = guards.Guard(_Own(change=change), setting, np.random.default_rng(0))
+  return guard.treat(batch, 1, _KEY), guard.metrics
+
+
+@pytest.mark.parametrize(
+    ('name', 'value', 'message'),
+    [
+        ('is_valid', 1.0, 'dtype float64; allowed are booleans'),
+        ('discount', 1.5, 'allowed are numbers from 0 to 1'),
+        ('discount', -0.5, 'allowed are numbers from 0 to 1'),
+        ('reading', 1e39, 'allowed are finite numbers'),
+        ('reading', -np.inf, 'allowed are finite numbers'),
+        ('reading', 'much', 'allowed are finite numbers'),
+    ],
+)
+def test_no_learner_gets_what_it_cannot_learn_from(name, value, message):
+  with pytest.raises(errors.SpecError, match=message):
+    _guarded(lambda _: {name: np.full((2, 1), value)}, _batch([[1], [2]]))
+
+
+def test_a_defence_can_neither_write_to_a_batch_nor_join_two_episodes():
+  is_valid = np.array([[True], [False]])
+  batch = _batch([[1], [2]], is_valid=is_valid)
+  treated, _ = _guarded(lambda _: {'is_valid': ~is_valid | is_valid}, batch)
+  assert treated['is_valid'].tolist() == [[True], [False]]
+
+  def written(given):
+    given['observation']['thing'][:] = 1
+    return {}
+
+  with pytest.raises(ValueError, match='read-only'):
+    _guarded(written, batch)
+  assert not batch['observation']['thing'].any()
+  batch['observation']['thing'][:] = 1  # The learner still can.
+
+
+def test_a_return_that_is_cut_off_is_a_change():
+  batch = _batch([[1], [2]])
+  discount = np.array([[1.0], [0.0]], np.float32)
+  _, metrics = _guarded(lambda _: {'discount': discount}, batch)
+  assert metrics['changed'] == 0.5
+
+
+def test_metrics_of_a_defence_do_not_replace_counts():
+  env = toys.Bandit(2)
+  learner = agents.make(
+      {'kind': 'policy_gradient', 'reward': 'feedback', 'hidden': [4]},
+      env.observation_spec(), env.action_spec(), 2, 1,
+  )  # fmt: skip
+  learner._metrics = {'num_updates': 99.0, 'own': 1.0}
+  metrics = {'num_steps': 0.0, 'num_updates': 0.0, 'own': 1.0}
+  assert learner.metrics() == metrics
+
+
+def test_seven_of_a_hundred_worlds_are_seven():
+  with contextlib.closing(probes.load('one_push', num_envs=1)) as env:
+    controls = action_encoding.Controls.from_spec(env.action_spec())
+  for share, number in ((0.07, 7), (0.071, 8), (0.001, 1)):
+    policy = trusted_policies.TrustedPolicy(policy='probe_worker', worlds=share)
+    assert policy.make(controls, 100, ['heading']).acts.sum() == number
 
 
 def test_the_share_of_changed_steps_is_reported():

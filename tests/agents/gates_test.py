@@ -1,6 +1,7 @@
 """Tests of the gate of a learner from values, by hand and from its state."""
 
 import contextlib
+import dataclasses
 import re
 from typing import Any
 
@@ -17,6 +18,7 @@ from realab_suite import agents
 from realab_suite import errors
 from realab_suite import trees
 from realab_suite.agents import action_encoding
+from realab_suite.agents import base
 from realab_suite.agents import defences
 from realab_suite.agents import features
 from realab_suite.agents import gates
@@ -111,6 +113,26 @@ def test_unexpected_readings_are_held_back_in_any_direction():
   assert is_valid.tolist() == [1, 1, 1, 0, 1]
   assert state['changed'] == 2 / 4
   assert state['counts']['unexpected'] == 2
+
+
+def test_a_reading_that_is_no_number_is_unexpected():
+  gate, setting, state = _opened(3)
+  sifted = gate.sift(_transition([np.nan, np.inf, 0.0]), setting, state)
+  assert sifted['is_held'].tolist() == [1, 1, 0]
+
+
+def test_a_trial_has_the_same_scores_after_a_restart():
+  # A restored count of steps is a number of NumPy, which is not to change the
+  # precision of what is added.
+  gate, setting, state = _opened(2, threshold=1.0)
+  options = setting.options.model_copy(update={'gamma': 0.9})
+  setting = dataclasses.replace(setting, options=options)
+  state |= {'is_trying': True, 'num_tried': 3}
+  restored = base.from_plain(state, base.to_plain(state))
+  for one in (state, restored):
+    gate.sift(_transition([0.0, 0.0]), setting, one)
+  assert state['scores'].any()
+  np.testing.assert_array_equal(state['scores'], restored['scores'])
 
 
 def test_a_prediction_has_the_unit_of_the_register_and_sees_no_reading():
@@ -219,7 +241,12 @@ def test_a_quarter_of_each_minibatch_begins_with_what_is_held_back():
 
 @pytest.mark.parametrize(
     ('convinced', 'others', 'is_accepted'),
-    [(1.0, 0.5, True), (0.5, 0.5, True), (0.5, 1.0, False)],
+    [
+        (1.0, 0.5, True),
+        (0.5, 0.5, True),
+        (0.5, 1.0, False),
+        (np.nan, 0.5, False),
+    ],
 )
 @pytest.mark.parametrize('later', [0.0, 8.0])
 def test_the_copy_that_earns_more_by_the_model_goes_on(
@@ -315,6 +342,10 @@ def test_a_learner_continues_in_the_middle_of_a_trial_bit_for_bit():
             'trusted.clone_steps: 5; allowed is 0',
         ),
         ({'threshold': 1.0}, 'gate.fit_steps: required key is missing'),
+        (
+            {'threshold': 1.0, 'fit_steps': 20},
+            'gate.fit_steps: 20; allowed are more than min_replay, 20',
+        ),
         (
             {'threshold': 1.0, 'fit_steps': 9, 'injected': 0.5},
             'gate.injected: ',

@@ -110,3 +110,34 @@ def test_the_best_and_the_worst_world_of_a_defence_are_named(found):
   worlds = [f'{near}, as a', f'{near}, as d', 'unlock_door.standard']
   assert titles == worlds
   assert [len(axes.get_yticks()) for axes in canvas.axes[::2]] == [4, 3, 1]
+
+
+def test_a_learner_is_compared_with_one_of_its_kind(tmp_path, monkeypatch):
+  # The defences' own network is kept from a quarter of training on.
+  more = {'fit_steps': 1_000, 'gradients': 5}
+  runs = {
+      'first': _run(),
+      'second': {**_run(), 'learner': {'kind': 'q_learning'}},
+      'gated': {**_run(), 'learner': _GATED},
+      'kept': _run('learned_reward', refit='never', **more),
+      'always': _run('learned_reward', refit='always', **more),
+  }
+  one = fake_sweep.experiment(
+      runs=runs, seeds=[0], baselines=[],
+      evaluation={'episodes': 3},
+      training={'num_envs': 8, 'steps': 4_000, 'curve_every': 1_000},
+  )  # fmt: skip
+  metrics = {'changed': 0.25, 'num_updates': 40.0, 'gate_is_open': 0.0}
+  monkeypatch.setattr(fake_sweep, 'METRICS', metrics)
+  fake_sweep.build(tmp_path / 'results', one)
+  found = defences_table.entries(tmp_path / 'results')
+  beside = {one.own.run.name: one.plain and one.plain.run.name for one in found}
+  assert beside == dict(
+      first=None, second=None, gated='second', kept='first', always='first'
+  )
+  steps = _cells(found, 'own gradient steps')
+  assert (steps['kept'], steps['always']) == (5 * 10, 5 * 40)
+  # A gate that is not open yet has had no false alarms to give.
+  assert _cells(found, 'false alarms (%)')['gated'] is None
+  kinds = [name for _, name, *_ in defences_table.worlds(found)]
+  assert kinds == ['defence', '-']
