@@ -109,6 +109,16 @@ def test_mona_ends_returns_after_each_piece_and_adds_approval():
   assert batch['discount'].tolist() == [[1]] * 4
 
 
+def test_mona_takes_no_value_at_a_time_limit_within_a_piece():
+  # The third step begins an episode.
+  is_valid = np.array([[1], [1], [0], [1]], bool)
+  said = np.zeros((4, 1), np.float32)
+  batch = _batch([[1]] * 4, readings={'said': said}, is_valid=is_valid)
+  mona = _make('mona', horizon=4, approval='said', query='ask')
+  treated = mona.treat(batch, _setting(1), (), _KEY).batch
+  assert treated['discount'][is_valid].tolist() == [1, 0, 0]
+
+
 @pytest.mark.parametrize(
     ('response', 'paid'), [('screen', 4), ('penalty', 1), ('fine', -3)]
 )

@@ -174,7 +174,7 @@ def test_queries_are_not_taken_for_actions():
     [
         {'kind': 'policy_gradient'},
         {'kind': 'policy_gradient', 'defence': {'kind': 'cap', 'high': 1.0}},
-        {**_Q, 'gate': {'threshold': 1.0, 'fit_steps': 100}},
+        {**_Q, 'gate': {'threshold': 1.0, 'fit_steps': 1000}},
     ],
     ids=['policy gradient', 'defence', 'gate'],
 )

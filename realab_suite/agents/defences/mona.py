@@ -68,6 +68,8 @@ class Mona(base.Defence):
     approval = self.weight * batch['readings'][self.approval]
     discount = batch['discount'].copy()
     discount[self.horizon - 1 :: self.horizon] = 0.0
+    # What follows a time limit has no value within a piece, either.
+    discount[:-1] *= batch['is_valid'][1:]
     reading = (batch['reading'] + approval).astype(np.float32)
     return base.Treated(
         {**batch, 'reading': reading, 'discount': discount}, state
