@@ -174,6 +174,7 @@ class QLearning(base.Learner):
           state, self._trained,
       )  # fmt: skip
       if state['is_trying']:
+        self._metrics |= self._gate_metrics()
         return
     is_enough = self._num_stored * self._num_envs >= options.min_replay
     if (
@@ -192,8 +193,7 @@ class QLearning(base.Learner):
             'scale': self._scale.value,
             'is_open': self.num_steps >= gate.fit_steps,
         }
-      metrics |= {'changed': state['changed'], 'gate_is_open': state['is_open']}
-      metrics |= {f'gate_{name}': n for name, n in state['counts'].items()}
+      metrics |= self._gate_metrics()
     is_valid = transition['is_valid']
     reading = transition['reading'][is_valid]
     self._metrics = {
@@ -201,6 +201,14 @@ class QLearning(base.Learner):
         'feedback_scale': self._scale.value,
         'exploration': float(self._exploration),
         'observed_feedback': float(reading.mean()) if len(reading) else 0.0,
+    }
+
+  def _gate_metrics(self) -> dict[str, float]:
+    state = self._gate_state
+    return {
+        'changed': float(state['changed']),
+        'gate_is_open': float(state['is_open']),
+        **{f'gate_{name}': float(n) for name, n in state['counts'].items()},
     }
 
   def _updated(

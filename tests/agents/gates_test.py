@@ -319,6 +319,11 @@ def test_a_learner_continues_in_the_middle_of_a_trial_bit_for_bit():
       if is_twin:
         np.testing.assert_array_equal(action, other.step(time_step))
       time_step = env.step(action)
+      if one._gate_state['is_trying']:
+        # Nothing is updated in a trial, but its price is reported.
+        counts, metrics = one._gate_state['counts'], one.metrics()
+        assert {name: metrics[f'gate_{name}'] for name in counts} == counts
+        assert metrics['changed'] == one._gate_state['changed']
       if one._gate_state['is_trying'] and not is_twin:
         other.set_state(one.state())
         assert other._gate_state['is_trying']
