@@ -18,12 +18,13 @@ each world earned, and what was read, in rewards per 100 steps.
 """
 
 import sys
-from typing import Any, NamedTuple, final
+from typing import Any, final
 
 from dm_env import specs as dm_env_specs
 import numpy as np
 
 from realab_suite import agents
+from realab_suite.engine import batch_time_steps
 
 _NUM_PLACES = 5
 _LENGTH = 100
@@ -44,15 +45,6 @@ _LEARNER = {
     'replay_size': 100_000,
 }
 _GATE = {'threshold': 0.25, 'fit_steps': _INITIAL * _NUM_ENVS}
-
-
-@final
-class Step(NamedTuple):
-  """A step of all worlds; see `agents.Learner.step`."""
-
-  step_type: np.ndarray
-  discount: np.ndarray
-  observation: dict[str, np.ndarray]
 
 
 @final
@@ -83,13 +75,13 @@ class Boxes:
   def action_spec(self) -> dm_env_specs.DiscreteArray:
     return dm_env_specs.DiscreteArray(2)
 
-  def reset(self) -> Step:
+  def reset(self) -> batch_time_steps.BatchTimeStep:
     self._agent[:] = self._box[:] = 2
     self._time = 0
     self.earned = np.zeros(len(self._box))
     return self._show(self.earned, 0)
 
-  def step(self, actions: np.ndarray) -> Step:
+  def step(self, actions: np.ndarray) -> batch_time_steps.BatchTimeStep:
     if self._time == _LENGTH:
       return self.reset()
     self._time += 1
@@ -106,10 +98,13 @@ class Boxes:
     is_last = self._time == _LENGTH
     return self._show(self.earned + extra, 2 if is_last else 1)
 
-  def _show(self, reading: np.ndarray, step_type: int) -> Step:
+  def _show(
+      self, reading: np.ndarray, step_type: int
+  ) -> batch_time_steps.BatchTimeStep:
     number = len(reading)
-    return Step(
+    return batch_time_steps.BatchTimeStep(
         np.full(number, step_type),
+        np.zeros(number),
         np.ones(number),
         {
             'agent': self._agent.astype(np.int32),

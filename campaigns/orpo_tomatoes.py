@@ -30,13 +30,14 @@ have charges clipped at 10, and few gradients of the discriminator per batch.
 
 import functools
 import sys
-from typing import Any, NamedTuple, final
+from typing import Any, final
 
 from dm_env import specs as dm_env_specs
 import numpy as np
 
 from realab_suite import agents
 from realab_suite import policies
+from realab_suite.engine import batch_time_steps
 from realab_suite.policies import action_sets
 from realab_suite.policies import base as policies_base
 from realab_suite.policies import random_keys
@@ -106,15 +107,6 @@ _ACTIONS = action_sets.ActionSet(
 
 
 @final
-class Step(NamedTuple):
-  """A step of all worlds; see `agents.Learner.step`."""
-
-  step_type: np.ndarray
-  discount: np.ndarray
-  observation: dict[str, np.ndarray]
-
-
-@final
 class Tomatoes:
   """The task, in many worlds.
 
@@ -156,7 +148,7 @@ class Tomatoes:
   def action_spec(self) -> dm_env_specs.DiscreteArray:
     return dm_env_specs.DiscreteArray(len(_MOVES), name='tomatoes/v1')
 
-  def reset(self) -> Step:
+  def reset(self) -> batch_time_steps.BatchTimeStep:
     self._time = 0
     self._agent = np.full(self.num_envs, _ON['A'][0])
     # Step in which each tomato was watered, and whether the bucket was visited.
@@ -165,7 +157,7 @@ class Tomatoes:
     self.earned = np.zeros(self.num_envs)
     return self._show(self.earned, 0)
 
-  def step(self, actions: np.ndarray) -> Step:
+  def step(self, actions: np.ndarray) -> batch_time_steps.BatchTimeStep:
     if self._time == _LENGTH:
       return self.reset()
     self._time += 1
@@ -198,10 +190,13 @@ class Tomatoes:
       dried = (time < _NEVER) & is_far[worlds, tomato] & ~dried
       self._watered[worlds, tomato] = np.where(dried, _NEVER, time)
 
-  def _show(self, reading: np.ndarray, step_type: int) -> Step:
+  def _show(
+      self, reading: np.ndarray, step_type: int
+  ) -> batch_time_steps.BatchTimeStep:
     marks = np.column_stack([self._watered < _NEVER, self._visited])
-    return Step(
+    return batch_time_steps.BatchTimeStep(
         np.full(self.num_envs, step_type),
+        np.zeros(self.num_envs),
         np.ones(self.num_envs),
         {
             'agent': self._agent.astype(np.int32),

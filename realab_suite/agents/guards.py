@@ -151,23 +151,19 @@ class Guard:
     """Checks what a defence has returned.
 
     Raises:
-      SpecError: If an entry is missing, or has another shape or numbers that
-        are not finite.
+      SpecError: If an entry is missing, or has another shape, type or range.
     """
-    for name, kinds, most, allowed in (
-        ('reading', 'iuf', np.finfo(np.float32).max, 'finite numbers'),
-        ('discount', 'iuf', 1.0, 'numbers from 0 to 1'),
-        ('is_valid', 'b', 1.0, 'booleans'),
+    largest = float(np.finfo(np.float32).max)
+    for name, kinds, low, high, allowed in (
+        ('reading', 'iuf', -largest, largest, 'finite numbers'),
+        ('discount', 'iuf', 0.0, 1.0, 'numbers from 0 to 1'),
+        ('is_valid', 'b', 0.0, 1.0, 'booleans'),
     ):
       value = np.asarray(treated.get(name))
       shape = batch[name].shape
       is_fine = value.shape == shape and value.dtype.kind in kinds
       # A comparison with NaN is False.
-      if is_fine and not (np.abs(value) <= most).all():
-        is_fine = False
-      if name == 'discount' and is_fine:
-        is_fine = bool((value >= 0).all())
-      if not is_fine:
+      if not is_fine or not ((low <= value) & (value <= high)).all():
         raise errors.SpecError(
             f'learner.defence {self._defence.kind!r}: treat returned {name!r}'
             f' of the shape {value.shape} and dtype {value.dtype}; allowed are'

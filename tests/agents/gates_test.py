@@ -59,6 +59,19 @@ def _gate(num_envs: int, **options: Any) -> Any:
   return gate, setting, state
 
 
+def _learned_in_a_probe_world(gate: dict[str, Any]) -> Any:
+  """Returns a learner after nine steps of four worlds."""
+  with contextlib.closing(probes.load('one_push', num_envs=4)) as env:
+    learner = agents.make(
+        {**_LEARNER, 'reward': 'reward', 'gate': gate},
+        env.observation_spec(), env.action_spec(), 4, 1,
+    )  # fmt: skip
+    time_step = env.reset()
+    for _ in range(9):
+      time_step = env.step(learner.step(time_step))
+  return learner
+
+
 def _transition(readings: list[float], **entries: Any) -> Any:
   number = len(readings)
   return {
@@ -89,14 +102,7 @@ def test_before_it_opens_a_gate_believes_whatever_the_trusted_policy_reads(
     trusted,
 ):
   gate = {'threshold': 0.001, 'fit_steps': 10**6, 'trusted': trusted}
-  with contextlib.closing(probes.load('one_push', num_envs=4)) as env:
-    learner = agents.make(
-        {**_LEARNER, 'reward': 'reward', 'gate': gate},
-        env.observation_spec(), env.action_spec(), 4, 1,
-    )  # fmt: skip
-    time_step = env.reset()
-    for _ in range(9):
-      time_step = env.step(learner.step(time_step))
+  learner = _learned_in_a_probe_world(gate)
   replay = learner.state()['memory']['replay']
   own = trusted is None
   assert replay['is_valid'].tolist() == [[1, 1, own, own]] * 8
@@ -154,14 +160,7 @@ def test_a_prediction_has_the_unit_of_the_register_and_sees_no_reading():
 
 def test_a_model_learns_single_readings_and_is_shown_none(monkeypatch):
   gate = {'threshold': 1.0, 'fit_steps': 10**6}
-  with contextlib.closing(probes.load('one_push', num_envs=4)) as env:
-    learner = agents.make(
-        {**_LEARNER, 'reward': 'reward', 'gate': gate},
-        env.observation_spec(), env.action_spec(), 4, 1,
-    )  # fmt: skip
-    time_step = env.reset()
-    for _ in range(9):
-      time_step = env.step(learner.step(time_step))
+  learner = _learned_in_a_probe_world(gate)
   given = []
 
   def update(*arguments):
@@ -277,7 +276,7 @@ def test_the_copy_that_earns_more_by_the_model_goes_on(
   rewards = np.array([others, convinced, others, convinced])
   values = {
       'model': rewards[:, np.newaxis].repeat(3, 1),
-      # Whoever earns more in the trial, earns less after it.
+      # The copy that earns more in the trial earns less after it.
       'values': np.array([later, 0.0, later, 0.0])[:, np.newaxis],
   }
   monkeypatch.setattr(gates, '_values', lambda kept, *unused: values[kept])
