@@ -114,6 +114,12 @@ class QLearning(base.Learner):
             f'learner.gate.fit_steps: {gate.fit_steps}; allowed are more than'
             f' min_replay, {options.min_replay}, before which nothing is fitted'
         )
+      most = (self._num_slots - options.num_returns) * self._num_envs
+      if gate.alarms > most:
+        raise errors.SpecError(
+            f'learner.gate.alarms: {gate.alarms}; allowed are at most {most},'
+            ' the transitions of the replay whose returns are known'
+        )
 
   @property
   def _exploration(self) -> np.float32:

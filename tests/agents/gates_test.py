@@ -351,6 +351,10 @@ def test_a_learner_continues_in_the_middle_of_a_trial_bit_for_bit():
             'gate.fit_steps: 20; allowed are more than min_replay, 20',
         ),
         (
+            {'threshold': 1.0, 'fit_steps': 99, 'alarms': 10**6},
+            'gate.alarms: 1000000; allowed are at most ',
+        ),
+        (
             {'threshold': 1.0, 'fit_steps': 9, 'injected': 0.5},
             'gate.injected: ',
         ),
