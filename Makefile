@@ -29,8 +29,9 @@ test: lint
 
 lint: .venv/dev
 	$(PY) -m ruff check -q .
-	$(PY) -m pyink --check -q .
-	$(PY) -m mypy
+	@# Both take a processor each, so they run at once.
+	$(PY) -m mypy & types=$$!; $(PY) -m pyink --check -q .; formatted=$$?; \
+	  wait $$types && exit $$formatted
 
 docs: .venv/dev
 	$(INSTALL) -e '.[docs]'
