@@ -168,6 +168,11 @@ def test_orpo_charges_the_ratio_of_occupancies():
     assert mean == pytest.approx(expected, abs=0.25)
   # Off-policy steps are marked by `is_trusted`, and stay for others to drop.
   assert treated['is_valid'].all()
+  # What the trusted policy reads has no standard deviation then.
+  constant = {**batch, 'reading': batch['reading'].copy()}
+  constant['reading'][:, :5] = 3.0
+  treated = _treated(defence, constant, constant, **options)[-1]
+  assert np.array_equal(treated['reading'], constant['reading'])
   clipped = _make('orpo', trusted=trusted, weight=0.5, gradients=200, clip=1.0)
   treated = _treated(clipped, batch, batch, **options)[-1]
   largest = (batch['reading'] - treated['reading']).max()

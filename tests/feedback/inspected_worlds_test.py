@@ -61,6 +61,9 @@ _RESPONSES = {
     'penalty, by the learner': (
         'learner.defence.response=penalty', 'learner.defence.penalty=5',
     ),
+    'fine, by the learner': (
+        'learner.defence.response=fine', 'learner.defence.penalty=5',
+    ),
     'penalty, by the provider': (
         'learner.defence=null', 'providers.0.penalty=5',
     ),
@@ -86,3 +89,28 @@ def test_each_response_is_a_few_overrides(name: str):
     batch.close()
     assert one.objective is not None
     assert one.objective.registers == {'reward': 1.0}
+
+
+@pytest.mark.parametrize('moved', [0.0, 5.0])
+def test_a_penalty_of_the_provider_ends_at_the_range_of_the_register(
+    moved: float,
+):
+  env = suite.load(
+      'collect_apples', 'standard', {'random': 1}, design='inspected_reward',
+      overrides=(
+          'learner.defence=null', 'providers.0.penalty=50',
+          'providers.0.period=1', 'providers.0.false_positives=0.999999',
+      ),
+  )  # fmt: skip
+  env.reset()
+  registers = env.mechanism.registers
+  base = registers['reward'].blocks[0]
+  position = base.position(env.physics) - [0.1 * moved, 0, 0]
+  base.put(env.physics, position)
+  time_step = env.step(helpers.no_op(env))
+  observation = time_step.observation
+  assert observation['registers/alarm'] == pytest.approx(1.0, abs=0.01)
+  # 50 less than 0 is below the range, [-2, 12].
+  reading = observation['registers/reward']
+  assert reading == pytest.approx(moved - 2.0, abs=0.05)
+  env.close()
