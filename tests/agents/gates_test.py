@@ -352,7 +352,7 @@ def test_a_learner_continues_in_the_middle_of_a_trial_bit_for_bit():
         ),
         (
             {'threshold': 1.0, 'fit_steps': 99, 'alarms': 10**6},
-            'gate.alarms: 1000000; allowed are at most ',
+            'gate.alarms: 1000000; allowed are at most 388, the transitions',
         ),
         (
             {'threshold': 1.0, 'fit_steps': 9, 'injected': 0.5},
