@@ -88,6 +88,17 @@ def _run(monkeypatch):
   signal.signal(signal.SIGTERM, handler)
 
 
+@pytest.fixture(name='interruptible')
+def _interruptible():
+  """Lets Ctrl-C interrupt; tests in the background of a script may ignore it.
+
+  So would the programs that they start.
+  """
+  handler = signal.signal(signal.SIGINT, signal.default_int_handler)
+  yield
+  signal.signal(signal.SIGINT, handler)
+
+
 def test_an_agent_that_ends_early_gives_one_line(tmp_path, run):
   ended = run(
       f'--output={tmp_path / "results"}', '--max_steps=3', '--design=none',
@@ -195,6 +206,7 @@ def test_an_agent_that_ignores_sigterm_is_killed(tmp_path, monkeypatch):
         ),
     ],
 )
+@pytest.mark.usefixtures('interruptible')
 def test_a_stopped_server_writes_its_results_and_one_line(
     tmp_path, number, status, error
 ):
@@ -214,6 +226,7 @@ def test_a_stopped_server_writes_its_results_and_one_line(
   assert not pathlib.Path(sockets.path_of(program.address)).exists()
 
 
+@pytest.mark.usefixtures('interruptible')
 def test_an_interrupt_waits_for_the_answer_to_a_request(tmp_path, caplog):
   is_interrupted = []
 
