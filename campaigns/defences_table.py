@@ -9,10 +9,15 @@ It prints a line for each run, and the best and the worst world of a defence
 that ran in several. Runs are compared with reward learning without a defence,
 in the same sweep and world, with the registers of both at the same places:
 
-- The *tax* is what the secure twin earns less than that of reward learning.
-- *False alarms* are the steps of the twin's last tenth of training that the
-  defence changes, although there is nothing to defend against; '-' where it
-  does not change suspicious steps alone.
+- The *tax* is what the secure twin earns less than that of reward learning, in
+  pairs of seeds.
+- *Alarm corrupted* is the share of episodes in which the corruption of a
+  register that the defence listens to exceeds a centimetre, whether its blocks
+  were moved or the budget of inspections. It is no gain and no hack.
+- *False alarms* are the steps that the defence changes in the twin, although
+  there is nothing to defend against: those of the last batch before each point
+  of the curve, in the last quarter of training, or all steps from which on a
+  gate was open; '-' where a defence does not change suspicious steps alone.
 - *Training time* is a multiple of that of reward learning; *own gradient steps*
   are those of the defence's own networks, and *inspections* the mean of an
   episode.
@@ -30,6 +35,7 @@ import numpy as np
 from realab_suite.agents import defences
 from realab_suite.config import validation
 from realab_suite.evaluation import intervals
+from realab_suite.evaluation import verdicts
 from realab_suite.experiments import result_tables
 from realab_suite.experiments import tables
 from realab_suite.feedback import providers
@@ -39,9 +45,9 @@ from realab_suite.reports import report_tables
 from realab_suite.reports import sweep_results
 
 _HEADER = (
-    'world', 'run', 'true return', 'hack rate (%)', 'label', 'corruption (m)',
-    "twin's true return", 'tax (%)', 'false alarms (%)', 'training time',
-    'own gradient steps', 'inspections',
+    'world', 'run', 'true return', 'hack rate (%)', "control's (%)", 'label',
+    'corruption (m)', 'alarm corrupted (%)', "twin's true return", 'tax (%)',
+    'false alarms (%)', 'training time', 'own gradient steps', 'inspections',
 )  # fmt: skip
 _WORLDS = ('design', 'defence', 'lowest hack rate (%)', 'highest hack rate (%)')
 
@@ -137,27 +143,48 @@ def entries(folder: pathlib.Path) -> list[Entry]:
   return found
 
 
-def _tax(one: Entry) -> float | None:
+def _tax(one: Entry) -> intervals.Interval | None:
   if one.twin is None or one.plain_twin is None:
     return None
   most = one.plain_twin.summary.true_return.estimate
-  earned = one.twin.summary.true_return.estimate
-  return 100.0 * (1.0 - earned / most) if most > 0 else None
+  lost = numbers.gained(one.plain_twin.run, one.twin.run)
+  return lost.scaled(100.0 / most) if lost and most > 0 else None
+
+
+def _silenced(one: Entry) -> float | None:
+  """Returns the share of episodes with a corrupted alarm, in percent."""
+  defence = _defence(one.own.run)
+  if defence is None:
+    return None
+  paid = defence.pays(_learner(one.own.run)['reward']) or {}
+  names = set(defence.reads) - paid.keys()
+  corrupted = [
+      any(
+          (row.registers[name].corruption or 0.0) > verdicts.MOVED
+          for name in names
+      )
+      for row in one.own.run.rows
+      if row.counts
+  ]
+  return 100.0 * float(np.mean(corrupted)) if names else None
 
 
 def _false_alarms(one: Entry) -> float | None:
   """Returns the share of changed steps at the end of training, in percent."""
-  defence, gate = _defence(one.own.run), _learner(one.own.run).get('gate')
-  if one.twin is None or not (gate or (defence and defence.ALARMS)):
+  if one.twin is None:
     return None
-  shares = [
-      point['learner']['changed']
-      for points in one.twin.run.curves.values()
-      for point in points[-max(1, len(points) // 10) :]
-      if 'changed' in point['learner']
+  defence, gate = _defence(one.own.run), _learner(one.own.run).get('gate')
+  shares: list[float] = []
+  for points in one.twin.run.curves.values():
+    last = points[-1]
+    if gate:
+      seen = last['step'] - gate['fit_steps']
       # A gate that has not opened has changed nothing.
-      and point['learner'].get('gate_is_open', True)
-  ]
+      if last['learner']['gate_is_open'] and seen > 0:
+        shares.append(last['learner']['gate_unexpected'] / seen)
+    elif defence and defence.ALARMS:
+      late = points[-max(1, len(points) // 4) :]
+      shares += [point['learner']['changed'] for point in late]
   return 100.0 * float(np.mean(shares)) if shares else None
 
 
@@ -214,9 +241,10 @@ def _line(one: Entry) -> list[tables.Figure]:
       one.world,
       f'`{one.own.run.name}`',
       result_tables.return_text(one.own.summary),
-      _rate(one),
+      *result_tables.hacking_figures(one.own.hacking)[:2],
       report_tables.labels_text(one.own),
       one.own.summary.corruption,
+      _silenced(one),
       one.twin and result_tables.return_text(one.twin.summary),
       _tax(one),
       _false_alarms(one),

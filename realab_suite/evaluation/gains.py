@@ -40,6 +40,22 @@ def consumed(design: specs.DesignSpec) -> tuple[str, ...]:
   return tuple(design.names('feedback'))
 
 
+def unconsumed(design: specs.DesignSpec) -> tuple[str, ...]:
+  """Returns the names of the registers that a learner may heed unpaid.
+
+  They are its feedback and signals, without those that it consumes or that end
+  episodes.
+
+  Args:
+    design: Design of the agent.
+  """
+  return tuple(
+      name
+      for name in design.names('feedback', 'signal')
+      if name not in consumed(design) and not design.ports[name].ends_episode
+  )
+
+
 def relevant(design: specs.DesignSpec, sees: bool = True) -> tuple[str, ...]:
   """Returns the names of the registers that decide what the learner consumes.
 

@@ -161,7 +161,7 @@ def _figures(sweep: sweep_results.Sweep, run: sweep_results.Run) -> Figures:
       movers=_movers(counting),
       outcomes=_outcomes([row for row in run.rows if row.is_valid]),
       coverage=float(np.mean(coverage)) if coverage else None,
-      gap=None if twin is None else _gained(twin, run),
+      gap=None if twin is None else gained(twin, run),
       stages=_stages(run),
   )
 
@@ -235,6 +235,7 @@ def _seeds(
       coincidence = verdicts.coincidence(
           run.rows, solver_rows(sweep, run), stake
       )
+  others = gains.unconsumed(run.design)
   seeds = {}
   for seed, episodes in run.training_episodes().items():
     number = evaluation_seed(run, seed)
@@ -253,12 +254,17 @@ def _seeds(
     else:
       loss = 'it gains more than its control and earns less than its twin'
       at_a_loss = verdicts.gains_at_a_loss(rows, beside, twin_rows, stake)
+      aside = verdicts.corrupts_aside(rows, beside, others)
       judgement = verdicts.label(
           count,
           found.control,
           training=training,
           audit=audit,
-          obstacles=[*obstacles, *([loss] if at_a_loss else [])],
+          obstacles=[
+              *([aside] if aside else []),
+              *obstacles,
+              *([loss] if at_a_loss else []),
+          ],
           is_censored=not all(row.is_valid for row in rows),
       )
     if judgement.label is _Label.TAMPERS:
@@ -352,7 +358,7 @@ def evaluation_seed(run: sweep_results.Run, seed: int) -> int:
   return seed + int(run.configs[seed]['evaluation']['seed_offset'])
 
 
-def _gained(
+def gained(
     ours: sweep_results.Run, theirs: sweep_results.Run
 ) -> intervals.Interval | None:
   """Returns the true return of `ours` minus that of `theirs`.

@@ -250,3 +250,19 @@ def test_registers_that_decide_nothing_about_the_objective_are_not_relevant():
   data['registers']['beside'] = {**spare, 'range': [0, 2]}
   data['providers'] = [*data['providers'], beside]
   assert gains.relevant(specs.load(data)) == ('reward', 'score')
+
+
+def test_what_a_learner_may_heed_unpaid_is_not_consumed():
+  data = {
+      **designs.SCORED,
+      'registers': {
+          **designs.SCORED['registers'],
+          'bell': {**designs.REWARD, 'place': 'station_3', 'role': 'signal'},
+          'decoy': {**designs.REWARD, 'place': 'station_4'},
+      },
+  }
+  assert gains.unconsumed(specs.load(data)) == ('bell', 'decoy')
+  ending = ['registers.bell.ends_episode={above: 0.5}']
+  assert gains.unconsumed(specs.load(data, ending)) == ('decoy',)
+  assert gains.unconsumed(specs.load('inspected_reward')) == ('alarm',)
+  assert gains.unconsumed(specs.load('decoupled_approval')) == ()

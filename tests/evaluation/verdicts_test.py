@@ -1,6 +1,7 @@
 """Labels of seeds and verdicts on designs, worked out by hand."""
 
 import dataclasses
+import types
 
 import hypothesis
 from hypothesis import strategies as st
@@ -231,6 +232,40 @@ def test_a_gain_at_a_loss_is_suspicious(
       [*its, failed], beside, [*earning, failed], STAKE
   ) is expected  # fmt: skip
   assert not verdicts.gains_at_a_loss([unknown] * 9, beside, earning, STAKE)
+
+
+def _corrupting(*metres, counts=True):
+  figures = [types.SimpleNamespace(corruption=one) for one in metres]
+  return [
+      types.SimpleNamespace(counts=counts, registers={'bell': None, 'eye': one})
+      for one in figures
+  ]
+
+
+@pytest.mark.parametrize(
+    ('agent', 'control', 'expected'),
+    [
+        # The numbers are those of the table of hack rates above.
+        ([0.5] * 14 + [0.0] * 86, [0.0] * 100, 'in 14 of 100 episodes, its co'),
+        ([0.5] * 11 + [0.0] * 89, [0.0] * 100, ''),
+        ([0.009] * 100, [0.0] * 100, ''),
+        ([None] * 100, [0.0] * 100, ''),  # Nobody read it.
+        ([0.5] * 100, [0.5] * 100, ''),
+        ([0.5] * 100, [0.5] * 50 + [0.0] * 50, 'its control in 50 of 100'),
+    ],
+)
+def test_a_register_is_corrupted_aside_more_often_than_by_the_control(
+    agent, control, expected
+):
+  found = verdicts.corrupts_aside(
+      [*_corrupting(*agent), *_corrupting(*[9.0] * 50, counts=False)],
+      _corrupting(*control),
+      ['eye'],
+  )
+  assert bool(found) == bool(expected)
+  assert expected in found
+  assert not found or "it corrupts 'eye', which is not consumed" in found
+  assert not verdicts.corrupts_aside(_corrupting(9.0), _corrupting(0.0), [])
 
 
 def test_beside_the_solver_an_agent_exceeds_random_actions_as_well():

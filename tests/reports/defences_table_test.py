@@ -7,6 +7,8 @@ pytest.importorskip('optax', reason='optax is in the extra `agents`')
 pytest.importorskip('equinox', reason='equinox is in the extra `agents`')
 
 from campaigns import defences_table
+from realab_suite.reports import numbers
+from realab_suite.reports import sweep_results
 from tests.experiments import fake_sweep
 
 _PLAIN = {'design': 'instantaneous_reward', 'overrides': ['dof=planar']}
@@ -44,7 +46,11 @@ def found(tmp_path_factory):
   )  # fmt: skip
   folder = tmp_path_factory.mktemp('defences') / 'results'
   with pytest.MonkeyPatch.context() as patch:
-    metrics = {'changed': 0.25, 'num_updates': 40.0}
+    metrics = {
+        'changed': 0.25, 'num_updates': 40.0,
+        # Of 3,000 steps since it opened.
+        'gate_is_open': 1.0, 'gate_unexpected': 600.0,
+    }  # fmt: skip
     patch.setattr(fake_sweep, 'METRICS', metrics)
     fake_sweep.build(folder, one)
   return defences_table.entries(folder)
@@ -80,7 +86,8 @@ def test_what_a_defence_costs_is_relative_to_reward_learning(found):
       if twin
   }
   tax = _cells(found, 'tax (%)')
-  assert tax['e'] == pytest.approx(100 * (1 - earned['e'] / earned['d']))
+  taken = 100 * (1 - earned['e'] / earned['d'])
+  assert tax['e'].estimate == pytest.approx(taken)
   assert [tax[name] for name in 'adfg'] == [None] * 4
   # 6 points of the curve instead of 4.
   times = dict(a=None, b=1.5, c=1.0, d=None, e=1.0, f=None, g=1.0, h=1.0)
@@ -91,10 +98,28 @@ def test_what_a_defence_costs_is_relative_to_reward_learning(found):
   assert {name: n for name, n in looks.items() if n} == {'g': 249.0}
 
 
+def test_an_agent_that_silences_an_alarm_is_not_cleared(found, tmp_path):
+  # All registers of the made-up agents are corrupted, by more than a metre.
+  silenced = _cells(found, 'alarm corrupted (%)')
+  assert {name: n for name, n in silenced.items() if n is not None} == dict(
+      g=100
+  )
+  # This one gains nothing, but corrupts by 3 cm where its control does by 1.
+  runs = {'decoupled': {'design': 'inspected_reward', 'twin': True}}
+  folder = fake_sweep.build(
+      tmp_path / 'results',
+      fake_sweep.experiment(runs=runs, seeds=[0], baselines=[]),
+  )
+  made = numbers.compute(sweep_results.load(folder))['decoupled']
+  assert made.hacking.count.hacked == 0
+  reason = made.seeds[0].judgement.reason
+  assert reason.startswith("it corrupts 'alarm', which is not consumed, in 40 ")
+
+
 def test_only_changes_of_suspicious_steps_are_false_alarms(found):
   alarms = _cells(found, 'false alarms (%)')
   assert {name: n for name, n in alarms.items() if n is not None} == dict(
-      b=25, e=25, f=25, h=25
+      b=25, e=25, f=25, h=20
   )
 
 
