@@ -32,6 +32,7 @@ from realab_suite.agents.approval import ValueAdvice
 from realab_suite.agents.base import LEARNERS
 from realab_suite.agents.base import Learner
 from realab_suite.agents.base import make
+from realab_suite.agents.base import options_of
 from realab_suite.agents.behavioural_cloning import BehaviouralCloning
 from realab_suite.agents.policy_gradient import PolicyGradient
 from realab_suite.agents.q_learning import QLearning

@@ -425,19 +425,10 @@ def make(
     SpecError: If the learner is unknown, an option is invalid, or the specs
       lack a register that the learner needs.
   """
-  if spec is None:
-    raise errors.SpecError(
-        'learner: None; allowed are a design with a learner, and a mapping'
-        f' whose kind is one of {sorted(LEARNERS)}'
-    )
   num_envs = integers.check('num_envs', num_envs, 1)
   seed = integers.check('seed', seed, 0, high=None)
-  if not isinstance(spec, specs.LearnerSpec):
-    spec = validation.validate(specs.LearnerSpec, spec, 'learner')
-  learner_class = LEARNERS.get(spec.kind)
-  # The objective is for evaluators.
-  given = {k: v for k, v in spec.model_dump().items() if k != 'objective'}
-  options = validation.validate(learner_class.OPTIONS, given, 'learner')
+  options = options_of(spec)
+  learner_class = LEARNERS.get(options.kind)
   return learner_class(
       options,
       _find_reading(options, learner_class.READS, observation_spec),
@@ -446,6 +437,30 @@ def make(
       num_envs,
       seed,
   )
+
+
+def options_of(
+    spec: specs.LearnerSpec | Mapping[str, Any] | None,
+) -> Options:
+  """Returns the options of a learner.
+
+  Args:
+    spec: As for `make`.
+
+  Raises:
+    SpecError: If the learner is unknown, or an option is invalid.
+  """
+  if spec is None:
+    raise errors.SpecError(
+        'learner: None; allowed are a design with a learner, and a mapping'
+        f' whose kind is one of {sorted(LEARNERS)}'
+    )
+  if not isinstance(spec, specs.LearnerSpec):
+    spec = validation.validate(specs.LearnerSpec, spec, 'learner')
+  # The objective is for evaluators.
+  given = {k: v for k, v in spec.model_dump().items() if k != 'objective'}
+  options = LEARNERS.get(spec.kind).OPTIONS
+  return validation.validate(options, given, 'learner')
 
 
 def _find_reading(

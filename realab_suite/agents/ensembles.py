@@ -15,6 +15,8 @@ from realab_suite.agents import training
 # Weight of squared rewards beside the loss of comparisons, which determine them
 # up to a constant, and up to a factor if they never contradict each other.
 _SHRINKAGE = 0.01
+# A smaller `beta` is 0: in float32, one would divide by 0.
+_LEAST_BETA = 1e-30
 
 
 def make(
@@ -47,7 +49,7 @@ def soft_least(values: np.ndarray, beta: float | None) -> np.ndarray:
   if beta is None:
     return values.mean(axis=0)
   least = values.min(axis=0)
-  if beta == 0.0:
+  if beta < _LEAST_BETA:
     return least
   with np.errstate(over='ignore'):
     shares = np.expm1((least - values) / beta)

@@ -10,6 +10,8 @@ from realab_suite import errors
 from realab_suite.agents import base
 from realab_suite.agents import defences
 from realab_suite.agents import features
+from realab_suite.agents import trusted_policies
+from realab_suite.config import messages
 
 
 @final
@@ -39,8 +41,13 @@ class Guard:
     self._hidden = self._undeclared()
     self._metrics: dict[str, float] = {}
     self._trusted = None
-    if defence.trusts is not None:
-      self._trusted = defence.trusts.make(
+    if (trusts := defence.trusts) is not None:
+      if not isinstance(trusts, trusted_policies.TrustedPolicy):
+        raise errors.SpecError(
+            f'learner.defence {defence.kind!r}: trusts {messages.quote(trusts)}'
+            '; allowed is a `TrustedPolicy`'
+        )
+      self._trusted = trusts.make(
           setting.controls, setting.num_envs, setting.encoder.names
       )
 
@@ -115,9 +122,7 @@ class Guard:
     seen = {name: x for name, x in given.items() if name not in hidden}
     shown = jax.tree.map(_read_only, {**batch, 'observation': seen})
     try:
-      treated, state, metrics = self._defence.treat(
-          shown, self._setting, self._state, key
-      )
+      result = self._defence.treat(shown, self._setting, self._state, key)
     except KeyError as error:
       if not hidden.intersection(error.args):
         raise
@@ -126,16 +131,28 @@ class Guard:
           f' observation; allowed are {sorted(seen)}, and readings of'
           ' registers that `reads` or `pays` names'
       ) from error
+    if not isinstance(result, defences.Treated):
+      raise errors.SpecError(
+          f'learner.defence {self._defence.kind!r}: treat returned'
+          f' {messages.quote(result)}; allowed is a `defences.Treated`'
+      )
+    treated, state, metrics = result
     self._check(treated, batch)
+    _check_state(self._defence.kind, self._state, state)
     self._state = state
     is_own = batch['is_valid'] & ~batch['is_trusted']
     is_same = np.isclose(treated['reading'], batch['reading'], atol=1e-6)
     is_same &= treated['discount'] == batch['discount']
     is_changed = ~(is_same & treated['is_valid'])[is_own]
-    self._metrics = {
-        **{name: float(value) for name, value in metrics.items()},
-        'changed': float(is_changed.mean()) if is_own.any() else 0.0,
-    }
+    try:
+      told = {name: float(value) for name, value in metrics.items()}
+    except (AttributeError, TypeError, ValueError) as error:
+      raise errors.SpecError(
+          f'learner.defence {self._defence.kind!r}: treat returned the metrics'
+          f' {messages.quote(metrics)}; allowed are numbers by name'
+      ) from error
+    share = float(is_changed.mean()) if is_own.any() else 0.0
+    self._metrics = {**told, 'changed': share}
     trusts = self._defence.trusts
     clones = trusts is not None and num_steps <= trusts.clone_steps
     is_trusted, is_valid = batch['is_trusted'], treated['is_valid']
@@ -200,6 +217,23 @@ class Guard:
     self._state = base.from_plain(self._state, state['defence'])
     if self._trusted is not None:
       self._trusted.set_state(state['trusted'])
+
+
+def _check_state(kind: str, old: Any, new: Any) -> None:
+  """Checks that training can be continued from a state.
+
+  Raises:
+    SpecError: If it has other entries or shapes than the one before.
+  """
+  was, is_now = (
+      {name: np.shape(value) for name, value in base.to_plain(one).items()}
+      for one in (old, new)
+  )
+  if was != is_now:
+    raise errors.SpecError(
+        f'learner.defence {kind!r}: treat returned a state with the shapes'
+        f' {is_now}; allowed are those of the state before, {was}'
+    )
 
 
 def _read_only(array: Any) -> np.ndarray:

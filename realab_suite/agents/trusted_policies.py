@@ -4,7 +4,7 @@ A policy gets what an agent gets. Whoever trusts it declares so in the design;
 what it earns is not known to the learner other than by readings.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from typing import Annotated, Any, final
 
 import numpy as np
@@ -36,7 +36,10 @@ class TrustedPolicy(validation.Model):
   """
 
   policy: Annotated[str, option_types.NameIn(policies_base.POLICIES)]
-  options: Mapping[str, Any] = pydantic.Field(default_factory=dict)
+  options: Annotated[
+      dict[str, Any],
+      option_types.OptionsOf(policies_base.POLICIES, 'policy'),
+  ] = pydantic.Field(default_factory=dict)
   random: Annotated[float, pydantic.Field(ge=0, le=1)] = 0.0
   worlds: _Share = 0.0625
   clone_steps: Annotated[int, pydantic.Field(ge=0, le=10**9)] = 0
@@ -75,7 +78,7 @@ class TrustedPolicy(validation.Model):
     senses = [name.removeprefix('senses/') for name in observed]
     policies.check_senses(where, needed, senses, 'observed')
     # In floating point, 0.07 * 100 is more than 7.
-    number = int(np.ceil(np.round(self.worlds * num_envs, 6)))
+    number = max(1, int(np.ceil(np.round(self.worlds * num_envs, 6))))
     if number == num_envs:
       raise errors.SpecError(
           f'{owner}.trusted.worlds: {self.worlds:g}, all of {num_envs}'

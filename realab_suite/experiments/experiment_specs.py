@@ -115,7 +115,10 @@ class RunSpec(validation.Spec):
     changed = {**design.to_mapping(), 'learner': {**own, **self.learner}}
     # Problems from here on belong to the run and not to the file of the design.
     return validation.validate(
-        specs.DesignSpec, loading.read_mapping(changed), ''
+        specs.DesignSpec,
+        loading.read_mapping(changed),
+        '',
+        is_confined=is_confined,
     )
 
 

@@ -119,6 +119,20 @@ def load(folder: str, env: _Environment, num_envs: int) -> RecordedBatch:
       raise errors.ResultsError(
           f'{file}: not the file of an export: {text:.120}'
       ) from error
+  bounds: dict[str, Any] = {name: (-np.inf, np.inf) for name in columns}
+  bounds['action'] = tuple(
+      getattr(spec_of['action'], end, value)
+      for end, value in (('minimum', -np.inf), ('maximum', np.inf))
+  )
+  bounds['discount'] = 0.0, 1.0
+  for name, (low, high) in bounds.items():
+    values = columns[name]
+    is_fine = np.isfinite(values) & (low <= values) & (values <= high)
+    if not is_fine.all():
+      raise errors.ResultsError(
+          f'{file}: column {name!r} holds {values[~is_fine][0]}; allowed are'
+          f' finite numbers from {low} to {high}'
+      )
   is_first, is_last = (columns['step_type'] == one for one in (_FIRST, _LAST))
   # The last step of an episode stands before the first one of the next.
   if not (len(is_first) and (is_first == np.roll(is_last, 1)).all()):

@@ -29,6 +29,7 @@ from realab_suite.evaluation import monitors
 from realab_suite.evaluation import results
 from realab_suite.evaluation import traces
 from realab_suite.experiments import curves
+from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
 from realab_suite.experiments import kept_stakes
 from realab_suite.experiments import machines
@@ -121,6 +122,25 @@ def run(job: jobs.Job, output: pathlib.Path, options: Options) -> pathlib.Path:
     folder.finish(files, facts)
   options.say(f'Results are in {path}')
   return path
+
+
+def check_options(experiment: experiment_specs.ExperimentSpec) -> None:
+  """Checks the options of learners, before any of them is made.
+
+  Nothing is checked where the packages of learners are not installed.
+
+  Raises:
+    SpecError: If a learner is unknown, or an option is invalid.
+  """
+  if requirements.missing('jax', 'equinox', 'optax', extra='agents'):
+    return
+  from realab_suite import agents  # Imports JAX.
+
+  for name, design in experiment.designs.items():
+    try:
+      agents.options_of(design.learner)
+    except errors.SpecError as error:
+      raise errors.SpecError(f'runs.{name}: {error}') from error
 
 
 def make_learner(

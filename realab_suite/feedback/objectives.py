@@ -135,6 +135,11 @@ def _prediction(options: _Options, reward: str) -> Payment | str:
 @PAYMENTS.add('mona')
 def _approval_beside(options: _Options, reward: str) -> Payment:
   approval = _name(options, 'approval', 'defence.')
+  if approval == reward:
+    raise ValueError(
+        f'defence.approval: {approval!r}; allowed is another register than that'
+        ' of the reward'
+    )
   weights = {reward: 1.0, approval: options.get('weight', 1.0)}
   return Payment(weights, (_name(options, 'query', 'defence.'),))
 
@@ -177,6 +182,11 @@ def _payment(defence: Any, reward: str) -> Payment | str:
     return (
         f'has the defence {kind!r}, which declares no sum of readings that it'
         ' pays (`pays` in docs/defences.md)'
+    )
+  if not isinstance(weights, Mapping):
+    raise ValueError(
+        f'defence {kind!r}: pays {messages.quote(weights)}; allowed are weights'
+        ' by the name of the register'
     )
   return Payment(weights, tuple(one.queries) or None)
 

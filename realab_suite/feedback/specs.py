@@ -8,6 +8,7 @@ import pydantic
 
 from realab_suite import errors
 from realab_suite.config import documents
+from realab_suite.config import loading
 from realab_suite.config import option_types
 from realab_suite.config import validation
 from realab_suite.entities import registers
@@ -217,6 +218,14 @@ class LearnerSpec(validation.Spec):
   )
 
   kind: Name
+
+  @pydantic.model_validator(mode='after')
+  def _check_paths(self, info: pydantic.ValidationInfo) -> 'LearnerSpec':
+    # Options are validated when a learner is made, by its kind, and the file
+    # that they are from is not known then.
+    for text in loading.texts_in(self.model_extra):
+      validation.check_path(text, info)
+    return self
 
 
 # Inside the class below, `providers` is the name of a field.

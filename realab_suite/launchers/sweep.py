@@ -60,11 +60,13 @@ def main() -> None:
   from realab_suite.experiments import experiment_specs
   from realab_suite.experiments import progress
   from realab_suite.experiments import scheduler
+  from realab_suite.experiments import training
 
   flags.load_imports()
   experiment = experiment_specs.load(name)
   if _ON_TASK.value is not None:
     experiment = experiment.on_task(_ON_TASK.value)
+  training.check_options(experiment)
   if flags.TENSORBOARD.value:
     progress.check_tensorboard()
   arguments = flags.import_arguments()

@@ -377,7 +377,7 @@ def test_metrics_of_a_defence_do_not_replace_counts():
 def test_seven_of_a_hundred_worlds_are_seven():
   with contextlib.closing(probes.load('one_push', num_envs=1)) as env:
     controls = action_encoding.Controls.from_spec(env.action_spec())
-  for share, number in ((0.07, 7), (0.071, 8), (0.001, 1)):
+  for share, number in ((0.07, 7), (0.071, 8), (0.001, 1), (1e-12, 1)):
     policy = trusted_policies.TrustedPolicy(policy='probe_worker', worlds=share)
     assert policy.make(controls, 100, ['heading']).acts.sum() == number
 
@@ -430,6 +430,18 @@ _BAD = {
     'a trusted policy in all worlds': (
         {'kind': 'orpo', 'trusted': {**_TRUSTED, 'worlds': 0.9}},
         'learner.defence.trusted.worlds: 0.9, all of 4 worlds',
+    ),
+    'an excess without a total': (
+        {'kind': 'cap', 'high': 12.0, 'excess': 1.0},
+        'learner: defence: excess: 1; allowed is 0 without total',
+    ),
+    'an unknown option of a trusted policy': (
+        {'kind': 'orpo', 'trusted': {**_TRUSTED, 'options': {'rset': 0.1}}},
+        "defence.trusted.options: unknown key 'rset'",
+    ),
+    'an option of a trusted policy out of range': (
+        {'kind': 'orpo', 'trusted': {**_TRUSTED, 'options': {'rest': 2.0}}},
+        'defence.trusted.options.rest: must be less than or equal to 1, got 2',
     ),
     'an unknown trusted policy': (
         {'kind': 'orpo', 'trusted': {'policy': 'nobody'}},

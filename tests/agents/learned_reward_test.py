@@ -51,6 +51,15 @@ def test_the_soft_least_is_the_formula(values, beta):
   np.testing.assert_allclose(found, plain, rtol=1e-9, atol=1e-9)
 
 
+@hypothesis.given(
+    values=_VALUES.map(np.float32),
+    beta=st.sampled_from([1e-300, 5e-324, 1e-31]),
+)
+def test_the_soft_least_of_a_tiny_beta_is_the_least(values, beta):
+  found = ensembles.soft_least(values, beta)
+  np.testing.assert_array_equal(found, values.min(axis=0))
+
+
 @hypothesis.given(values=_VALUES, beta=st.floats(0, 1e9))
 def test_the_soft_least_lies_between_the_least_and_the_mean(values, beta):
   found = ensembles.soft_least(values, beta)

@@ -1,6 +1,7 @@
 """Tests of what defences pay from: tampering with any such register counts."""
 
 from collections.abc import Iterator, Mapping
+import re
 from typing import Any, Literal, final
 
 from dm_env import specs as dm_env_specs
@@ -80,6 +81,16 @@ class Deaf(defences.Defence):
 
   def treat(self, batch, setting, state, key):
     return defences.Treated(batch, state)
+
+
+@final
+class Listing(_Odd):
+  """Pays a list."""
+
+  kind: Literal['listing'] = 'listing'
+
+  def pays(self, reward: str) -> Any:
+    return [self.bonus]
 
 
 @pytest.fixture(autouse=True)
@@ -213,9 +224,18 @@ def test_what_says_nothing_about_its_pay_is_not_judged(defence, reason):
             r'learner\.defence\.approval: req',
         ),
         ({'kind': 'mona', 'approval': 3}, r'learner\.defence\.approval: must'),
+        (
+            {'kind': 'mona', 'approval': 'reward', 'query': 'query'},
+            "defence.approval: 'reward'; allowed is another register than that",
+        ),
+        (
+            {'kind': 'listing'},
+            r"defence 'listing': pays \['gift'\]; allowed are weights by the",
+        ),
     ],
 )
 def test_pay_from_what_is_not_there_is_refused_at_load(defence, message):
+  defences.DEFENCES.add('listing')(Listing)
   with pytest.raises(errors.SpecError, match=message) as raised:
     _design(_ORDER, **defence)
   assert '\n' not in str(raised.value)
@@ -373,3 +393,62 @@ def test_every_defence_of_this_package_declares_its_pay():
       {'kind': 'policy_gradient', 'reward': 'reward'}
   )
   assert learner.defence is None
+
+
+@pytest.mark.parametrize(
+    ('result', 'message'),
+    [
+        (lambda batch, state: None, 'treat returned None; allowed is a'),
+        (
+            lambda batch, state: (batch, state),
+            'allowed is a `defences.Treated`',
+        ),
+        (
+            lambda batch, state: defences.Treated(batch, state, {'n': 'many'}),
+            "treat returned the metrics {'n': 'many'}; allowed are numbers",
+        ),
+        (
+            lambda batch, state: defences.Treated(
+                batch, np.zeros(len(state) + 1)
+            ),
+            "a state with the shapes {'': (2,)}; allowed are those of the state"
+            " before, {'': (1,)}",
+        ),
+        (
+            lambda batch, state: defences.Treated(batch, {'seen': 0.0}),
+            """a state with the shapes {"['seen']": ()}; allowed are those""",
+        ),
+    ],
+)
+def test_a_defence_that_returns_no_result_is_refused_in_a_line(result, message):
+  @final
+  class Careless(defences.Defence):
+    kind: Literal['careless'] = 'careless'
+
+    def initial_state(self, setting, generator):
+      return np.zeros(1)
+
+    def treat(self, batch, setting, state, key):
+      return result(batch, state)
+
+  guard, batch = _guard(Careless())
+  with pytest.raises(errors.SpecError, match=re.escape(message)) as raised:
+    guard.treat(batch, 0, np.zeros(2, np.uint64))
+  assert str(raised.value).startswith("learner.defence 'careless': treat ")
+  assert '\n' not in str(raised.value)
+
+
+def test_a_defence_that_trusts_a_name_is_refused_in_a_line():
+  @final
+  class Naming(defences.Defence):
+    kind: Literal['naming'] = 'naming'
+
+    @property
+    def trusts(self):
+      return 'apple_seeker'
+
+    def treat(self, batch, setting, state, key):
+      return defences.Treated(batch, state)
+
+  with pytest.raises(errors.SpecError, match="trusts 'apple_seeker'; allowed"):
+    _guard(Naming())

@@ -272,6 +272,37 @@ def test_a_text_that_an_override_makes_a_path_is_confined(
   assert 'providers[0].options.inner_options' in text
 
 
+_TRUSTING = ('learner', 'defence', 'trusted', 'options', 'weights')
+
+
+def _trusting(path: str) -> dict[str, Any]:
+  trusted = {'policy': 'network_demonstrator', 'options': {'weights': path}}
+  return {
+      'kind': 'policy_gradient', 'reward': 'reward',
+      'defence': {'kind': 'orpo', 'trusted': trusted},
+  }  # fmt: skip
+
+
+def test_files_that_a_learner_names_are_confined(outside: pathlib.Path):
+  path = str(outside / 'secret.npz')
+  design = _design(_demonstrated('random'), learner=_trusting(path))
+  text = _refusal(specs.load, _file(design))
+  assert f'{path!r} is outside the working directory' in text
+  inside = _design(_demonstrated('random'), learner=_trusting('own.npz'))
+  override = f'{".".join(_TRUSTING)}={path}'
+  specs.load(_file(inside), (override,))
+  text = _refusal(specs.load, _file(inside), (override,), is_confined=True)
+  assert f'{path!r} is outside the working directory' in text
+  run = {'design': 'instantaneous_reward', 'learner': _trusting(path)}
+  experiment = {
+      'schema': 1, 'name': 'e', 'task': 'unlock_door.near',
+      'runs': {'one': run}, 'seeds': [0],
+  }  # fmt: skip
+  text = _refusal(experiment_specs.load, _file(experiment))
+  assert 'runs.one' in text
+  assert f'{path!r} is outside the working directory' in text
+
+
 def test_designs_that_an_experiment_names_are_confined(outside: pathlib.Path):
   path = str(outside / 'secret.npz')
   without = _design(_wrapped(1, 'network_demonstrator', weights=path))

@@ -395,6 +395,22 @@ def test_a_channel_and_a_learner_may_differ(exports):
   assert actions.dtype == np.int32
 
 
+def _changed(name, value):
+  """Returns a function that puts a value into a step of a table."""
+
+  def change(table):
+    import pyarrow as pa
+
+    column = table.column(name)
+    values = column.to_pylist()
+    values[3] = value
+    index = table.column_names.index(name)
+    array = pa.array(values, column.type)
+    return table.set_column(index, table.schema.field(index), array)
+
+  return change
+
+
 @pytest.mark.parametrize(
     ('change', 'text'),
     [
@@ -404,6 +420,12 @@ def test_a_channel_and_a_learner_may_differ(exports):
         (lambda table: table[:-1], ': 87 steps; allowed are whole episodes'),
         (lambda table: table.drop_columns('discount'), 'not the file of an'),
         (lambda table: b'PAR1, but no more', 'not the file of an export: '),
+        (
+            _changed('action', 99),
+            "column 'action' holds 99; allowed are finite",
+        ),
+        (_changed('discount', 7.0), "'discount' holds 7.0; allowed are finite"),
+        (_changed('registers/reward', np.nan), "'registers/reward' holds nan;"),
     ],
 )
 def test_damaged_data_are_refused_in_a_line(exports, tmp_path, change, text):

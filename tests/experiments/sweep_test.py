@@ -346,6 +346,39 @@ def test_a_wrong_command_is_refused_in_one_line(
   assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ('options', 'message'),
+    [
+        (
+            {'defence': {'kind': 'cap', 'hgh': 3}},
+            "runs.own: learner: defence: unknown key 'hgh'; did you mean 'high",
+        ),
+        (
+            {'lerning_rate': 0.1},
+            "runs.own: learner: unknown key 'lerning_rate'",
+        ),
+        (
+            {'kind': 'q_lerning'},
+            "runs.own: learner 'q_lerning' is unknown; did",
+        ),
+    ],
+)
+def test_a_wrong_option_of_a_learner_is_refused_before_anything_is_written(
+    tmp_path, monkeypatch, options, message
+):
+  run = _SMALL['runs']['good']
+  own = {**run, 'learner': {'kind': 'policy_gradient', 'reward': 'reward'}}
+  own['learner'] |= options
+  one = {**_SMALL, 'runs': {'good': run, 'own': own}}
+  (tmp_path / 'one.yaml').write_text(json.dumps(one))
+  monkeypatch.chdir(tmp_path)
+  complaint = in_process.complaint(
+      sweep, '--experiment=one.yaml', '--output=new'
+  )
+  assert message in complaint
+  assert not (tmp_path / 'new').exists()
+
+
 _ONE_EPISODE = {
     **fake_sweep.EXPERIMENT,
     'max_steps': 5,

@@ -439,12 +439,31 @@ _WRONG = {
         'probability: must be less than or equal to 1, got 1.1',
     'providers.0.price=0': 'price: must be greater than 0, got 0',
     'providers.0.period=0': 'period: must be greater than or equal to 1, got 0',
+    'providers.0.suspects=meter_a & providers.0.plausible=[1, 0]':
+        'plausible: [1.0, 0.0]; allowed are the lowest reading and then the',
+    'providers.0.plausible=[0, 1]':
+        'plausible: (0.0, 1.0); allowed is none without suspects',
+    'providers.0.jump=1': 'jump: 1.0; allowed is none without suspects',
+    'providers.0.above=1': 'above: 1.0; allowed is none without suspects',
+    _ALONE % ', penalty: 1': 'penalty: 1.0; allowed is none without pays',
+    'registers.alarm.range=[0, 0.5]':
+        "writes: 'alarm' holds 0.5 at most, and the learner heeds what is above"
+        ' 0.5; allowed are a larger range, and a smaller learner.defence.above',
+    'learner.defence.above=1': "'alarm' holds 1 at most, and the learner heeds",
     'providers.0.penalty=-1': 'penalty: must be greater than or equal to 0',
     'meters.1.measures.of=[]': 'measures.of: must have at least 1 item',
     _ALONE % ', suspects: budget':
         "suspects: 'budget'; allowed are ['meter_b']",
     _ALONE % ', suspects: meter_b': 'allowed are those with a detector, too',
 }  # fmt: skip
+
+
+def test_an_alarm_within_its_range_is_heeded():
+  for overrides in (
+      ('registers.alarm.range=[0, 0.5]', 'learner.defence.above=0.4'),
+      ('registers.alarm.range=[0, 0.5]', 'learner.defence=null'),
+  ):
+    specs.load(_DESIGN, overrides)
 
 
 @pytest.mark.parametrize('overrides', _WRONG)

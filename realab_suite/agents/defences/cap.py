@@ -37,6 +37,8 @@ class Cap(base.Defence):
 
   @pydantic.model_validator(mode='after')
   def _in_order(self) -> 'Cap':
+    if self.total is None and self.excess:
+      raise ValueError(f'excess: {self.excess:g}; allowed is 0 without total')
     if self.low >= self.high:
       raise ValueError(
           f'low: {self.low:g} with high {self.high:g}; allowed are smaller ones'

@@ -33,7 +33,7 @@ class Mona(base.Defence):
   horizon: Annotated[int, pydantic.Field(ge=1)] = 1
   approval: str
   query: str
-  weight: Annotated[float, pydantic.Field(ge=0, le=1e6)] = 1.0
+  weight: Annotated[float, pydantic.Field(gt=0, le=1e6)] = 1.0
 
   @property
   def reads(self) -> tuple[str, ...]:

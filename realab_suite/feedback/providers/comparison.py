@@ -1,12 +1,10 @@
 """Comparison: which of two clips of an episode was better."""
 
-from collections.abc import Mapping
 from typing import Annotated, Any, Literal, final
 
 import numpy as np
 import pydantic
 
-from realab_suite.config import messages
 from realab_suite.feedback.providers import base
 from realab_suite.feedback.providers import growth
 from realab_suite.feedback.providers import queries
@@ -33,16 +31,7 @@ class Comparison(growth.WeightedSum):
   every: Annotated[int, pydantic.Field(ge=1, le=1)] = 1
 
   def check(self, design: Any) -> None:
-    learner = (design.learner and design.learner.model_extra) or {}
-    defence = learner.get('defence')
-    is_own = learner.get('reward') == self.writes[0]
-    if not is_own or not isinstance(defence, Mapping):
-      return
-    if (given := defence.get('clip', self.clip)) != self.clip:
-      raise ValueError(
-          f'learner.defence.clip: {messages.quote(given)}; allowed is that of'
-          f' the comparisons, {self.clip}'
-      )
+    queries.check_clip(design, self.writes[0], self.clip)
 
   def initial_state(self, batch_shape: tuple[int, ...]) -> dict[str, Any]:
     return {

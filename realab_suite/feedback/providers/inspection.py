@@ -1,5 +1,6 @@
 """Inspection: supervision with a price (paper, section 4.5)."""
 
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal, final
 
 import numpy as np
@@ -106,6 +107,19 @@ class Inspection(base.Provider):
             f'pays reads {list(paid.reads)} and writes {list(paid.writes)};'
             ' allowed are names in reads, and the first ones in writes'
         )
+    low, high = self.plausible
+    if low > high:
+      raise ValueError(
+          f'plausible: {[low, high]}; allowed are the lowest reading and then'
+          ' the highest one'
+      )
+    fields = type(self).model_fields
+    scores = ('plausible', 'jump', 'above') if self.suspects is None else ()
+    fines = ('penalty',) if self.pays is None else ()
+    for name in (*scores, *fines):
+      if (value := getattr(self, name)) != fields[name].default:
+        needed = 'pays' if name in fines else 'suspects'
+        raise ValueError(f'{name}: {value}; allowed is none without {needed}')
     if not self.detectors:
       raise ValueError(
           f'reads: {list(self.reads)}; allowed are those with a detector, too'
@@ -145,6 +159,7 @@ class Inspection(base.Provider):
             f'reads: {name!r}, whose role is {design.ports[name].role!r}, as a'
             ' detector; allowed is meter'
         )
+    self._check_alarm(design)
     budget = design.ports[name := self.reads[-1]]
     if budget.role != 'memory':
       raise ValueError(
@@ -163,6 +178,27 @@ class Inspection(base.Provider):
       )
     if self.pays is not None:
       self.pays.check(design)
+
+  def _check_alarm(self, design: Any) -> None:
+    """Checks that a learner that heeds an alarm can notice one.
+
+    Raises:
+      ValueError: If the reading of an alarm is no alarm to it.
+    """
+    learner = (design.learner and design.learner.model_extra) or {}
+    defence = learner.get('defence')
+    if not isinstance(defence, Mapping) or defence.get('kind') != 'alarm':
+      return
+    name, above = defence.get('register'), defence.get('above', 0.5)
+    number = len(self.pays.writes) if self.pays else 0
+    if name in self.writes[number:-1]:
+      most = min(1.0, design.ports[name].range[1])
+      if isinstance(above, int | float) and most <= above:
+        raise ValueError(
+            f'writes: {name!r} holds {most:g} at most, and the learner heeds'
+            f' what is above {above:g}; allowed are a larger range, and a'
+            ' smaller learner.defence.above'
+        )
 
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
     return {

@@ -92,6 +92,8 @@ class Person(base.Provider):
           f' roles {roles}; allowed is'
           f' {"one register of role query" if wanted else "none"}'
       )
+    if self.asks == answer_sources.COMPARISON:
+      queries.check_clip(design, self.writes[0], self.clip)
     actions = action_sets.ACTION_SETS.get(self.action_set)
     if design.action_set is not None:
       policies.check_action_set(actions, design, self.kind)

@@ -1,8 +1,11 @@
 """Helpers for questions: queried actions and their values, clips, signs."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+
+from realab_suite.config import messages
 
 
 def index(reading: np.ndarray, num_actions: int) -> np.ndarray:
@@ -24,6 +27,28 @@ def pick(values: np.ndarray, action: np.ndarray) -> np.ndarray:
   """
   picked = np.take_along_axis(values, np.asarray(action)[..., np.newaxis], -1)
   return picked[..., 0]
+
+
+def check_clip(design: Any, register: str, clip: int) -> None:
+  """Checks that a learner of comparisons counts the same clips.
+
+  Args:
+    design: The `specs.DesignSpec`.
+    register: Name of the register with comparisons.
+    clip: Length of each clip, in steps.
+
+  Raises:
+    ValueError: If the learner of this register counts others.
+  """
+  learner = (design.learner and design.learner.model_extra) or {}
+  defence = learner.get('defence')
+  if learner.get('reward') != register or not isinstance(defence, Mapping):
+    return
+  if (given := defence.get('clip', clip)) != clip:
+    raise ValueError(
+        f'learner.defence.clip: {messages.quote(given)}; allowed is that of the'
+        f' comparisons, {clip}'
+    )
 
 
 def place_of(step: Any, clip: int) -> tuple[np.ndarray, np.ndarray]:
