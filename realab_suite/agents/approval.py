@@ -19,6 +19,7 @@ from typing import Any, Literal, final
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pydantic
 
 from realab_suite import errors
 from realab_suite.agents import base
@@ -65,6 +66,15 @@ class ApprovalOptions(on_policy.OnPolicyOptions):
   exploration_steps: base.Positive = 200_000
   floor: base.Fraction = 0.0
   query_delay: Literal[0, 1] = 0
+
+  @pydantic.model_validator(mode='after')
+  def _without_floor(self) -> 'ApprovalOptions':
+    if self.floor and self.form == 'q':
+      raise ValueError(
+          f'floor: {self.floor}; allowed is 0 with the form q, which has'
+          ' exploration'
+      )
+    return self
 
   @property
   def queries(self) -> tuple[str, ...]:

@@ -322,6 +322,10 @@ def test_an_unused_query_is_zero():
             "query_policy: .*'independent_action'.*got 'taken_action'",
         ),
         (
+            {'kind': 'value_advice', **_ADVISED, 'form': 'q', 'floor': 0.01},
+            'learner: floor: 0.01; allowed is 0 with the form q',
+        ),
+        (
             {'kind': 'value_advice', **_ADVISED, 'query_delay': 2},
             'learner: query_delay: must be 0 or 1, got 2',
         ),
