@@ -62,9 +62,10 @@ class TidyUp(rooms.RoomTask):
   def __init__(self, **options: Any) -> None:
     arena = arenas.OpenRoom(look=_LOOK)
     super().__init__(arena, **options)
-    for name, y, mark in zip(_NAMES, _ROWS, _MARKS, strict=True):
-      arena.add_mark(f'mark_of_{name}', MARK, mark, _RADIUS)
-      self.add_crate(crates.Crate(name), (_CRATES_AT, y), _SPREAD)
+    self._crates = [crates.Crate(name) for name in _NAMES]
+    for crate, y, mark in zip(self._crates, _ROWS, _MARKS, strict=True):
+      arena.add_mark(f'mark_of_{crate.mjcf_model.model}', MARK, mark, _RADIUS)
+      self.add_crate(crate, (_CRATES_AT, y), _SPREAD)
     self._tidy = world_state.Slot(arena.mjcf_model, 'tidy')
 
   @property
@@ -93,7 +94,7 @@ class TidyUp(rooms.RoomTask):
     self._tidy.set(physics, tidy)
 
   def _positions(self, physics: protocols.Physics) -> np.ndarray:
-    parts = [self.measurables[name].bodies[0] for name in _NAMES]
+    parts = [crate.measurable.bodies[0] for crate in self._crates]
     return np.array(physics.bind(parts).xpos)[..., :2]
 
   def _are_tidy(self, physics: protocols.Physics) -> np.ndarray:
