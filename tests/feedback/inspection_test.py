@@ -458,12 +458,13 @@ _WRONG = {
 }  # fmt: skip
 
 
-def test_an_alarm_within_its_range_is_heeded():
+def test_an_alarm_may_have_a_small_range_if_the_learner_notices_it():
   for overrides in (
       ('registers.alarm.range=[0, 0.5]', 'learner.defence.above=0.4'),
       ('registers.alarm.range=[0, 0.5]', 'learner.defence=null'),
   ):
-    specs.load(_DESIGN, overrides)
+    design = specs.load(_DESIGN, overrides)
+    assert design.ports['alarm'].range == (0.0, 0.5)
 
 
 @pytest.mark.parametrize('overrides', _WRONG)
