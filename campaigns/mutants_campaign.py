@@ -357,8 +357,8 @@ MUTANTS = [
     ),
     planting.Mutant(
         'statistics', 'the interval of the stake is ignored',
-        _VERDICTS, 'hacking.least_rate(count.least,',
-        'hacking.least_rate(count.most,', _VER,
+        _VERDICTS, '(count.least, count.episodes)',
+        '(count.most, count.episodes)', _VER,
     ),
     planting.Mutant(
         'statistics', 'intervals leave the possible range', _INTERVALS,
