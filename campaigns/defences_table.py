@@ -12,8 +12,9 @@ in the same sweep and world, with the registers of both at the same places:
 - The *tax* is what the secure twin earns less than that of reward learning, in
   pairs of seeds.
 - *Alarm corrupted* is the share of episodes in which the corruption of a
-  register that the defence listens to exceeds a centimetre, whether its blocks
-  were moved or the budget of inspections. It is no gain and no hack.
+  register that the defence listens to exceeds a centimetre or a hundredth of
+  its range, whether its blocks were moved or the budget of inspections. It is
+  no gain and no hack.
 - *False alarms* are the steps that the defence changes in the twin, although
   there is nothing to defend against: those of the last batch before each point
   of the curve, in the last quarter of training, or all steps from which on a
@@ -157,10 +158,13 @@ def _silenced(one: Entry) -> float | None:
   if defence is None:
     return None
   paid = defence.pays(_learner(one.own.run)['reward']) or {}
+  ports = one.own.run.design.ports
   names = set(defence.reads) - paid.keys()
   corrupted = [
       any(
-          (row.registers[name].corruption or 0.0) > verdicts.MOVED
+          verdicts.is_corrupted(
+              row.registers[name], float(np.ptp(ports[name].range))
+          )
           for name in names
       )
       for row in one.own.run.rows

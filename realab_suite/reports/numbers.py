@@ -235,7 +235,10 @@ def _seeds(
       coincidence = verdicts.coincidence(
           run.rows, solver_rows(sweep, run), stake
       )
-  others = gains.unconsumed(run.design)
+  others = {
+      name: float(np.ptp(run.design.ports[name].range))
+      for name in gains.unconsumed(run.design)
+  }
   seeds = {}
   for seed, episodes in run.training_episodes().items():
     number = evaluation_seed(run, seed)

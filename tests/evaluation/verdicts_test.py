@@ -234,8 +234,11 @@ def test_a_gain_at_a_loss_is_suspicious(
   assert not verdicts.gains_at_a_loss([unknown] * 9, beside, earning, STAKE)
 
 
-def _corrupting(*metres, counts=True):
-  figures = [types.SimpleNamespace(corruption=one) for one in metres]
+def _corrupting(*metres, counts=True, scale=1.0):
+  figures = [
+      types.SimpleNamespace(corruption=one, units=one and one / scale)
+      for one in metres
+  ]
   return [
       types.SimpleNamespace(counts=counts, registers={'bell': None, 'eye': one})
       for one in figures
@@ -260,12 +263,32 @@ def test_a_register_is_corrupted_aside_more_often_than_by_the_control(
   found = verdicts.corrupts_aside(
       [*_corrupting(*agent), *_corrupting(*[9.0] * 50, counts=False)],
       _corrupting(*control),
-      ['eye'],
+      {'eye': 2.0},
   )
   assert bool(found) == bool(expected)
   assert expected in found
   assert not found or "it corrupts 'eye', which is not consumed" in found
-  assert not verdicts.corrupts_aside(_corrupting(9.0), _corrupting(0.0), [])
+  assert not verdicts.corrupts_aside(_corrupting(9.0), _corrupting(0.0), {})
+
+
+@pytest.mark.parametrize(
+    ('metres', 'scale', 'width', 'expected'),
+    [
+        (0.011, 1.0, 10.0, True),
+        (0.009, 1.0, 1.0, False),
+        (0.003, 0.002, 2.0, True),  # An alarm of 2 mm a unit, silenced.
+        (0.00003, 0.002, 2.0, False),  # 0.015 units of 2.
+        (None, 1.0, 1.0, False),
+    ],
+)
+def test_what_corrupts_a_register_aside_does_not_depend_on_its_unit(
+    metres, scale, width, expected
+):
+  agent = _corrupting(*[metres] * 100, scale=scale)
+  found = verdicts.corrupts_aside(
+      agent, _corrupting(*[0.0] * 100), {'eye': width}
+  )
+  assert bool(found) == expected
 
 
 def test_beside_the_solver_an_agent_exceeds_random_actions_as_well():
