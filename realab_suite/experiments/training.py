@@ -5,7 +5,7 @@ A checkpoint contains the full state; lines that were written after it are
 removed.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 import contextlib
 import dataclasses
 import os
@@ -37,6 +37,7 @@ from realab_suite.experiments import progress
 from realab_suite.experiments import recorded_data
 from realab_suite.experiments import requirements
 from realab_suite.experiments import storage
+from realab_suite.feedback import specs
 
 if TYPE_CHECKING:
   from realab_suite import agents
@@ -130,7 +131,8 @@ def check_options(experiment: experiment_specs.ExperimentSpec) -> None:
   Nothing is checked where the packages of learners are not installed.
 
   Raises:
-    SpecError: If a learner is unknown, or an option is invalid.
+    SpecError: If a learner is unknown, an option is invalid, or a defence
+      listens to a register that no provider writes.
   """
   if requirements.missing('jax', 'equinox', 'optax', extra='agents'):
     return
@@ -138,9 +140,22 @@ def check_options(experiment: experiment_specs.ExperimentSpec) -> None:
 
   for name, design in experiment.designs.items():
     try:
-      agents.options_of(design.learner)
+      options = agents.options_of(design.learner)
+      defence = getattr(options, 'defence', None)
+      _check_listening(design, defence.reads if defence else ())
     except errors.SpecError as error:
       raise errors.SpecError(f'runs.{name}: {error}') from error
+
+
+def _check_listening(design: specs.DesignSpec, names: Sequence[str]) -> None:
+  """Refuses a defence to which nobody can speak."""
+  written = {name for one in design.providers for name in one.writes}
+  for name in names:
+    if name in design.ports and name not in written:
+      raise errors.SpecError(
+          f'learner.defence: listens to {name!r}, which no provider writes;'
+          f' allowed are {sorted(written)}'
+      )
 
 
 def make_learner(

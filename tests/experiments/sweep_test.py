@@ -361,6 +361,11 @@ def test_a_wrong_command_is_refused_in_one_line(
             {'kind': 'q_lerning'},
             "runs.own: learner 'q_lerning' is unknown; did",
         ),
+        (
+            {'defence': {'kind': 'alarm', 'register': 'bell'}},
+            "runs.own: learner.defence: listens to 'bell', which no provider"
+            " writes; allowed are ['reward']",
+        ),
     ],
 )
 def test_a_wrong_option_of_a_learner_is_refused_before_anything_is_written(
@@ -369,6 +374,10 @@ def test_a_wrong_option_of_a_learner_is_refused_before_anything_is_written(
   run = _SMALL['runs']['good']
   own = {**run, 'learner': {'kind': 'policy_gradient', 'reward': 'reward'}}
   own['learner'] |= options
+  own['overrides'] = [
+      'registers.bell={kind: two_block, role: signal, place: station_4,'
+      ' range: [0, 1]}'
+  ]
   one = {**_SMALL, 'runs': {'good': run, 'own': own}}
   (tmp_path / 'one.yaml').write_text(json.dumps(one))
   monkeypatch.chdir(tmp_path)
