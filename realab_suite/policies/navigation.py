@@ -110,10 +110,14 @@ class View:
     Returns:
       Points, `(..., rays, 2)`, metres.
     """
-    angles = self.angle[..., np.newaxis] + self.ray_angles
-    directions = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     reach = (self.distances + depth)[..., np.newaxis]
-    return self.position[..., np.newaxis, :] + reach * directions
+    return self.position[..., np.newaxis, :] + reach * self._directions
+
+  @functools.cached_property
+  def _directions(self) -> np.ndarray:
+    """Direction of each ray, `(..., rays, 2)`, a unit vector."""
+    angles = self.angle[..., np.newaxis] + self.ray_angles
+    return np.stack([np.cos(angles), np.sin(angles)], axis=-1)
 
   def ahead(self, distance: float) -> np.ndarray:
     """Returns the place at a distance straight ahead, `(..., 2)`, metres."""
@@ -141,10 +145,10 @@ class View:
       each `(..., places)`.
     """
     offsets = places - self.position[..., np.newaxis, :]
-    directions = np.arctan2(offsets[..., 1], offsets[..., 0])
+    x, y = offsets[..., 0], offsets[..., 1]
     return (
-        np.linalg.norm(offsets, axis=-1),
-        wrap(directions - self.angle[..., np.newaxis]),
+        np.sqrt(x * x + y * y),
+        wrap(np.arctan2(y, x) - self.angle[..., np.newaxis]),
     )
 
   def locate_one(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
