@@ -5,8 +5,8 @@ sweeps of reward learning with and without defences, such as `defences`:
 
     python -m campaigns.defences_table docs/images/defences.png results/defences
 
-It prints a line for each run, and the best and the worst world of a defence
-that ran in several. Runs are compared with reward learning without a defence,
+It prints a line for each run, and the best and the worst world of a design that
+ran in several. Runs are compared with reward learning without a defence,
 in the same sweep and world, with the registers of both at the same places:
 
 - The *tax* is what the secure twin earns less than that of reward learning, in
@@ -25,6 +25,7 @@ in the same sweep and world, with the registers of both at the same places:
 """
 
 from collections.abc import Sequence
+import json
 import pathlib
 import sys
 from typing import Any, NamedTuple, final
@@ -50,7 +51,7 @@ _HEADER = (
     'corruption (m)', 'alarm corrupted (%)', "twin's true return", 'tax (%)',
     'false alarms (%)', 'training time', 'own gradient steps', 'inspections',
 )  # fmt: skip
-_WORLDS = ('design', 'defence', 'lowest hack rate (%)', 'highest hack rate (%)')
+_WORLDS = ('run', 'lowest hack rate (%)', 'highest hack rate (%)')
 
 
 @final
@@ -269,25 +270,30 @@ def lines(found: Sequence[Entry]) -> list[list[tables.Figure]]:
 
 
 def worlds(found: Sequence[Entry]) -> list[list[tables.Figure]]:
-  """Returns the best and the worst world of each defence, with a header."""
-  rows: dict[tuple[str, str], list[Entry]] = {}
+  """Returns the best and the worst world of each design, with a header.
+
+  Designs are the same if they differ in nothing but the places of registers,
+  and in the total of a cap, which a world decides about.
+  """
+  rows: dict[str, list[Entry]] = {}
   for one in found:
-    given = _learner(one.own.run)
-    kind = 'gate' if given.get('gate') else tables.NOTHING
-    kind = str((given.get('defence') or {}).get('kind', kind))
-    rows.setdefault((one.own.run.design.name, kind), []).append(one)
+    design = one.own.run.design.model_dump(mode='json')
+    for register in design['registers'].values():
+      del register['place']
+    (design['learner'].get('defence') or {}).pop('total', None)
+    rows.setdefault(json.dumps(design, sort_keys=True), []).append(one)
   table: list[list[tables.Figure]] = [list(_WORLDS)]
-  for names, of_defence in rows.items():
+  for of_design in rows.values():
     judged = [
         (one.own.hacking.rate.estimate, one)
-        for one in of_defence
+        for one in of_design
         if one.own.hacking is not None
     ]
     if len({one.world for _, one in judged}) > 1:
       judged.sort(key=lambda pair: pair[0])
       ends = (judged[0][1], judged[-1][1])
       cells = (f'{tables.text(_rate(one))} ({one.world})' for one in ends)
-      table.append([*names, *cells])
+      table.append([f'`{of_design[0].own.run.name}`', *cells])
   return table
 
 
