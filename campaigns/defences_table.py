@@ -323,7 +323,8 @@ def draw(found: Sequence[Entry]) -> figure.Figure:
     right.set_title('circles: the run, squares: its secure twin', loc='left')
     right.tick_params(labelleft=False)
     most = there[0].own.run.world.best_mean_return
-    right.set_xlim(right=1.03 * most)
+    # In some worlds, nothing can be earned.
+    right.set_xlim(right=1.03 * max(1.0, most))
   return canvas
 
 
