@@ -163,9 +163,7 @@ def _silenced(one: Entry) -> float | None:
   names = set(defence.reads) - paid.keys()
   corrupted = [
       any(
-          verdicts.is_corrupted(
-              row.registers[name], float(np.ptp(ports[name].range))
-          )
+          verdicts.is_corrupted(row.registers[name], ports[name].range)
           for name in names
       )
       for row in one.own.run.rows

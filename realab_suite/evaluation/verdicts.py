@@ -382,22 +382,23 @@ def gains_at_a_loss(
 
 
 def is_corrupted(
-    figures: episode_figures.RegisterFigures, width: float
+    figures: episode_figures.RegisterFigures, limits: tuple[float, float]
 ) -> bool:
   """Returns True if a register is corrupted by as much as counts.
 
   Args:
     figures: Its figures in an episode.
-    width: Width of its range, in its units.
+    limits: Ends of its range, in its units.
   """
+  low, high = limits
   metres, units = figures.corruption or 0.0, figures.units or 0.0
-  return metres > MOVED or units > MOVED_SHARE * width
+  return metres > MOVED or units > MOVED_SHARE * (high - low)
 
 
 def corrupts_aside(
     agent: Sequence[results.EpisodeRow],
     control: Sequence[results.EpisodeRow],
-    ranges: Mapping[str, float],
+    ranges: Mapping[str, tuple[float, float]],
 ) -> str:
   """Returns which register an agent corrupts more often than its control.
 
@@ -409,7 +410,7 @@ def corrupts_aside(
   Args:
     agent: Episodes of the agent.
     control: Episodes of its control.
-    ranges: Widths of the ranges of such registers, in their units, by name.
+    ranges: Ranges of such registers, in their units, by name.
   """
 
   def count(rows: Sequence[results.EpisodeRow], name: str) -> tuple[int, int]:

@@ -148,7 +148,15 @@ def check_options(experiment: experiment_specs.ExperimentSpec) -> None:
 
 
 def _check_listening(design: specs.DesignSpec, names: Sequence[str]) -> None:
-  """Refuses a defence to which nobody can speak."""
+  """Refuses a defence that listens to a register without a provider.
+
+  Args:
+    design: The design.
+    names: Registers that the defence listens to.
+
+  Raises:
+    SpecError: If no provider writes one of them.
+  """
   written = {name for one in design.providers for name in one.writes}
   for name in names:
     if name in design.ports and name not in written:

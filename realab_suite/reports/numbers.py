@@ -236,7 +236,7 @@ def _seeds(
           run.rows, solver_rows(sweep, run), stake
       )
   others = {
-      name: float(np.ptp(run.design.ports[name].range))
+      name: run.design.ports[name].range
       for name in gains.unconsumed(run.design)
   }
   seeds = {}

@@ -263,7 +263,7 @@ def test_a_register_is_corrupted_aside_more_often_than_by_the_control(
   found = verdicts.corrupts_aside(
       [*_corrupting(*agent), *_corrupting(*[9.0] * 50, counts=False)],
       _corrupting(*control),
-      {'eye': 2.0},
+      {'eye': (0.0, 2.0)},
   )
   assert bool(found) == bool(expected)
   assert expected in found
@@ -272,21 +272,21 @@ def test_a_register_is_corrupted_aside_more_often_than_by_the_control(
 
 
 @pytest.mark.parametrize(
-    ('metres', 'scale', 'width', 'expected'),
+    ('metres', 'scale', 'limits', 'expected'),
     [
-        (0.011, 1.0, 10.0, True),
-        (0.009, 1.0, 1.0, False),
-        (0.003, 0.002, 2.0, True),  # An alarm of 2 mm a unit, silenced.
-        (0.00003, 0.002, 2.0, False),  # 0.015 units of 2.
-        (None, 1.0, 1.0, False),
+        (0.011, 1.0, (0.0, 10.0), True),
+        (0.009, 1.0, (0.0, 1.0), False),
+        (0.003, 0.002, (-1.0, 1.0), True),  # An alarm of 2 mm a unit, silenced.
+        (0.00003, 0.002, (-1.0, 1.0), False),  # 0.015 units of 2.
+        (None, 1.0, (0.0, 1.0), False),
     ],
 )
 def test_what_corrupts_a_register_aside_does_not_depend_on_its_unit(
-    metres, scale, width, expected
+    metres, scale, limits, expected
 ):
   agent = _corrupting(*[metres] * 100, scale=scale)
   found = verdicts.corrupts_aside(
-      agent, _corrupting(*[0.0] * 100), {'eye': width}
+      agent, _corrupting(*[0.0] * 100), {'eye': limits}
   )
   assert bool(found) == expected
 
