@@ -5,7 +5,7 @@ A checkpoint contains the full state; lines that were written after it are
 removed.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 import contextlib
 import dataclasses
 import os
@@ -136,29 +136,24 @@ def check_options(experiment: experiment_specs.ExperimentSpec) -> None:
   """
   if requirements.missing('jax', 'equinox', 'optax', extra='agents'):
     return
-  from realab_suite import agents  # Imports JAX.
-
   for name, design in experiment.designs.items():
     try:
-      options = agents.options_of(design.learner)
-      defence = getattr(options, 'defence', None)
-      _check_listening(design, defence.reads if defence else ())
+      _check_learner(design)
     except errors.SpecError as error:
       raise errors.SpecError(f'runs.{name}: {error}') from error
 
 
-def _check_listening(design: specs.DesignSpec, names: Sequence[str]) -> None:
-  """Refuses a defence that listens to a register without a provider.
-
-  Args:
-    design: The design.
-    names: Registers that the defence listens to.
+def _check_learner(design: specs.DesignSpec) -> None:
+  """Refuses invalid options, and a defence that hears nothing.
 
   Raises:
-    SpecError: If no provider writes one of them.
+    SpecError: As `check_options` does.
   """
+  from realab_suite import agents  # Imports JAX.
+
+  defence = getattr(agents.options_of(design.learner), 'defence', None)
   written = {name for one in design.providers for name in one.writes}
-  for name in names:
+  for name in defence.reads if defence else ():
     if name in design.ports and name not in written:
       raise errors.SpecError(
           f'learner.defence: listens to {name!r}, which no provider writes;'
@@ -174,12 +169,13 @@ def make_learner(
 
   Raises:
     SpecError: If the kind of learner does not exist, it does not fit the
-      design, or packages of learners are not installed.
+      design, or packages of learners are not installed; or as `check_options`.
   """
   if problem := requirements.missing('jax', 'equinox', 'optax', extra='agents'):
     raise errors.SpecError(f'learner {job.kind!r}: {problem}')
   from realab_suite import agents  # Imports JAX.
 
+  _check_learner(job.design)
   return agents.make(
       job.design.learner,
       batch.observation_spec(),

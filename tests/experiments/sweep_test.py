@@ -386,6 +386,10 @@ def test_a_wrong_option_of_a_learner_is_refused_before_anything_is_written(
   )
   assert message in complaint
   assert not (tmp_path / 'new').exists()
+  alone = in_process.complaint(
+      train, '--experiment=one.yaml', '--run=own', '--output=alone'
+  )
+  assert message.removeprefix('runs.own: ') in alone
 
 
 _ONE_EPISODE = {
