@@ -368,7 +368,7 @@ def test_a_wrong_command_is_refused_in_one_line(
         ),
     ],
 )
-def test_a_wrong_option_of_a_learner_is_refused_before_anything_is_written(
+def test_a_wrong_option_of_a_learner_is_refused_before_anything_is_trained(
     tmp_path, monkeypatch, options, message
 ):
   run = _SMALL['runs']['good']
