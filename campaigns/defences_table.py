@@ -7,7 +7,9 @@ sweeps of reward learning with and without defences, such as `defences`:
 
 It prints a line for each run, and the best and the worst world of a design that
 ran in several. Runs are compared with reward learning without a defence,
-in the same sweep and world, with the registers of both at the same places:
+in the same sweep and world, with the registers of both at the same places. Of
+several such runs, it is the one whose twin earns most. Other options of the two
+may differ, such as the number of steps, and are not compared:
 
 - The *tax* is what the secure twin earns less than that of reward learning, in
   pairs of seeds.
@@ -115,11 +117,15 @@ def entries(folder: pathlib.Path) -> list[Entry]:
     found = run and sweep.twin(run)
     return figures.get(found.name) if found else None
 
+  def earned(run: sweep_results.Run) -> float:
+    found = twin(run)
+    return found.summary.true_return.estimate if found else -np.inf
+
   beside: dict[str, sweep_results.Run | None] = {}
   for run in runs:
     kind = run.design.learner.kind
     same = [
-        (_common(run, one), one.design.learner.kind == kind, -i)
+        (_common(run, one), one.design.learner.kind == kind, earned(one), -i)
         for i, one in enumerate(runs)
         if _is_plain(one) and _common(run, one)
     ]

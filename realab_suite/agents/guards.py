@@ -39,6 +39,8 @@ class Guard:
     self._state = defence.initial_state(setting, generator)
     self._reads = {name: self._key_of(name) for name in defence.reads}
     self._hidden = self._undeclared()
+    if self._key_of(setting.options.reward) in self._hidden:
+      self._hidden |= {'reading'}
     self._metrics: dict[str, float] = {}
     self._trusted = None
     if (trusts := defence.trusts) is not None:
@@ -85,7 +87,8 @@ class Guard:
       return frozenset()
     names = self._setting.encoder.names
     readings = {name for name in names if name.startswith('registers/')}
-    declared = {self._key_of(one) for one in (reward, *paid, *defence.reads)}
+    payers = [name for name, weight in paid.items() if weight]
+    declared = {self._key_of(one) for one in (*payers, *defence.reads)}
     # A memory is made of readings.
     return frozenset({*readings, features.MEMORY} - declared)
 
@@ -120,15 +123,16 @@ class Guard:
     """
     given, hidden = batch['observation'], self._hidden
     seen = {name: x for name, x in given.items() if name not in hidden}
-    shown = jax.tree.map(_read_only, {**batch, 'observation': seen})
+    entries = {name: x for name, x in batch.items() if name not in hidden}
+    shown = jax.tree.map(_read_only, {**entries, 'observation': seen})
     try:
       result = self._defence.treat(shown, self._setting, self._state, key)
     except KeyError as error:
       if not hidden.intersection(error.args):
         raise
       raise errors.SpecError(
-          f'learner.defence {self._defence.kind!r}: takes {error} from the'
-          f' observation; allowed are {sorted(seen)}, and readings of'
+          f'learner.defence {self._defence.kind!r}: takes {error} from a'
+          f' batch; allowed are {sorted(seen)}, and readings of'
           ' registers that `reads` or `pays` names'
       ) from error
     if not isinstance(result, defences.Treated):
@@ -179,12 +183,15 @@ class Guard:
       value = np.asarray(treated.get(name))
       shape = batch[name].shape
       is_fine = value.shape == shape and value.dtype.kind in kinds
-      # A comparison with NaN is False.
-      if not is_fine or not ((low <= value) & (value <= high)).all():
+      what = f'of the shape {value.shape} and dtype {value.dtype}'
+      if is_fine:
+        # A comparison with NaN is False.
+        wrong = value[~((low <= value) & (value <= high))]
+        is_fine, what = not wrong.size, f'with {wrong[:1]}'
+      if not is_fine:
         raise errors.SpecError(
             f'learner.defence {self._defence.kind!r}: treat returned {name!r}'
-            f' of the shape {value.shape} and dtype {value.dtype}; allowed are'
-            f' {allowed} of the shape {shape}'
+            f' {what}; allowed are {allowed} of the shape {shape}'
         )
 
   @property

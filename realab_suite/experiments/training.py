@@ -132,7 +132,7 @@ def check_options(experiment: experiment_specs.ExperimentSpec) -> None:
 
   Raises:
     SpecError: If a learner is unknown, an option is invalid, or a defence
-      listens to a register that no provider writes.
+      listens to anything but a register that a provider writes.
   """
   if requirements.missing('jax', 'equinox', 'optax', extra='agents'):
     return
@@ -141,6 +141,23 @@ def check_options(experiment: experiment_specs.ExperimentSpec) -> None:
       _check_learner(design)
     except errors.SpecError as error:
       raise errors.SpecError(f'runs.{name}: {error}') from error
+
+
+def check_defence(design: specs.DesignSpec) -> None:
+  """Checks the options of a learner with a defence, as far as it is known.
+
+  Raises:
+    SpecError: As `check_options` does.
+  """
+  learner = design.learner
+  if learner is None or not (learner.model_extra or {}).get('defence'):
+    return
+  if requirements.missing('jax', 'equinox', 'optax', extra='agents'):
+    return
+  from realab_suite import agents  # Imports JAX.
+
+  if learner.kind in agents.LEARNERS:
+    _check_learner(design)
 
 
 def _check_learner(design: specs.DesignSpec) -> None:
@@ -154,10 +171,10 @@ def _check_learner(design: specs.DesignSpec) -> None:
   defence = getattr(agents.options_of(design.learner), 'defence', None)
   written = {name for one in design.providers for name in one.writes}
   for name in defence.reads if defence else ():
-    if name in design.ports and name not in written:
+    if name not in written:
       raise errors.SpecError(
-          f'learner.defence: listens to {name!r}, which no provider writes;'
-          f' allowed are {sorted(written)}'
+          f'learner.defence: listens to {name!r}, which is no register that a'
+          f' provider writes; allowed are {sorted(written)}'
       )
 
 

@@ -169,8 +169,13 @@ def _payment(defence: Any, reward: str) -> Payment | str:
     defence: Options of the defence, or `None`.
     reward: Name of the register that the learner reads.
   """
-  if not isinstance(defence, Mapping):
+  if defence is None:
     return Payment({reward: 1.0})
+  if not isinstance(defence, Mapping):
+    raise ValueError(
+        f'learner.defence: {messages.quote(defence)}; allowed are a mapping'
+        ' with a kind, and null'
+    )
   kind: Any = defence.get('kind')
   is_name = isinstance(kind, str)
   if is_name and kind in PAYMENTS:
@@ -183,10 +188,10 @@ def _payment(defence: Any, reward: str) -> Payment | str:
         f'has the defence {kind!r}, which declares no sum of readings that it'
         ' pays (`pays` in docs/defences.md)'
     )
-  if not isinstance(weights, Mapping):
+  if not isinstance(weights, Mapping) or not any(weights.values()):
     raise ValueError(
         f'defence {kind!r}: pays {messages.quote(weights)}; allowed are weights'
-        ' by the name of the register'
+        ' by the name of the register, one of which is not 0'
     )
   return Payment(weights, tuple(one.queries) or None)
 

@@ -58,6 +58,7 @@ def main() -> int:
   from realab_suite.audit import findings
   from realab_suite.evaluation import results
   from realab_suite.experiments import storage
+  from realab_suite.experiments import training
 
   flags.load_imports()
   settings = audits.Settings(
@@ -67,6 +68,7 @@ def main() -> int:
       budget=_BUDGET.value,
       target=flags.TARGET.value,
   )
+  training.check_defence(settings.design)
   with _progress() as on_progress:
     auditor = audits.Auditor(settings, on_progress)
     output, folder = flags.OUTPUT.value, None

@@ -128,7 +128,8 @@ def test_an_alarm_leaves_steps_out_or_charges_them(response, paid):
   alarm = np.array([[0, 0], [0.6, 0.5], [9, 0]], np.float32)
   is_valid = np.array([[1, 1], [1, 1], [0, 1]], bool)
   batch = _batch([[4, 4]] * 3, readings={'bell': alarm}, is_valid=is_valid)
-  defence = _make('alarm', register='bell', response=response, penalty=3.0)
+  charge = {} if response == 'screen' else {'penalty': 3.0}
+  defence = _make('alarm', register='bell', response=response, **charge)
   assert defence.reads == ('bell',)
   treated = defence.treat(batch, _setting(2), (), _KEY).batch
   if response == 'screen':
@@ -187,7 +188,10 @@ def test_orpo_charges_the_ratio_of_occupancies():
             "treat returned 'reading' of the shape (3,)",
         ),
         ({'discount': None}, "treat returned 'discount' of the shape ()"),
-        ({'reading': np.full((11, 4), np.nan)}, 'allowed are finite numbers'),
+        (
+            {'reading': np.full((11, 4), np.nan)},
+            "treat returned 'reading' with [nan]; allowed are finite numbers",
+        ),
     ],
 )
 def test_a_defence_that_returns_something_else_is_refused(entries, message):
@@ -430,6 +434,27 @@ _BAD = {
     'a trusted policy in all worlds': (
         {'kind': 'orpo', 'trusted': {**_TRUSTED, 'worlds': 0.9}},
         'learner.defence.trusted.worlds: 0.9, all of 4 worlds',
+    ),
+    'a cap on nothing': (
+        {'kind': 'cap'},
+        'learner: defence: caps nothing; allowed are low, high and total',
+    ),
+    'a penalty of 0': (
+        {
+            'kind': 'alarm',
+            'register': 'reward',
+            'response': 'fine',
+            'penalty': 0.0,
+        },
+        'penalty: 0 with response fine; allowed is more than 0',
+    ),
+    'a penalty of steps that are left out': (
+        {'kind': 'alarm', 'register': 'reward', 'penalty': 5.0},
+        'penalty: 5 with response screen; allowed is none',
+    ),
+    'another spelling of an option': (
+        {'kind': 'alarm', 'register_name': 'reward'},
+        'learner: defence.register: required key is missing',
     ),
     'an excess without a total': (
         {'kind': 'cap', 'high': 12.0, 'excess': 1.0},

@@ -93,6 +93,16 @@ class Listing(_Odd):
     return [self.bonus]
 
 
+@final
+class Unpaid(_Odd):
+  """Pays nothing."""
+
+  kind: Literal['unpaid'] = 'unpaid'
+
+  def pays(self, reward: str) -> Mapping[str, float]:
+    return {reward: 0.0}
+
+
 @pytest.fixture(autouse=True)
 def _registered() -> Iterator[None]:
   with registries.preserved():
@@ -171,7 +181,7 @@ def test_tampering_with_whatever_a_defence_pays_from_is_seen(
         ({'kind': 'paying', 'factor': 0.0}, {'reward': 1.0, 'fine': -0.5},
          None),
         ({'kind': 'deaf', 'source': 'comparisons'}, {'reward': 1.0}, None),
-        ({'kind': 'cap'}, {'reward': 1.0}, None),
+        ({'kind': 'cap', 'high': 2.0}, {'reward': 1.0}, None),
         ({'kind': 'alarm', 'register': 'bribe'}, {'reward': 1.0}, None),
     ],
 )  # fmt: skip
@@ -232,10 +242,12 @@ def test_what_says_nothing_about_its_pay_is_not_judged(defence, reason):
             {'kind': 'listing'},
             r"defence 'listing': pays \['gift'\]; allowed are weights by the",
         ),
+        ({'kind': 'unpaid'}, r"defence 'unpaid': pays \{'reward': 0.0\}; all"),
     ],
 )
 def test_pay_from_what_is_not_there_is_refused_at_load(defence, message):
   defences.DEFENCES.add('listing')(Listing)
+  defences.DEFENCES.add('unpaid')(Unpaid)
   with pytest.raises(errors.SpecError, match=message) as raised:
     _design(_ORDER, **defence)
   assert '\n' not in str(raised.value)
@@ -307,7 +319,7 @@ _EVERY = {'light', 'reward', 'gift', 'fine', 'bribe', 'learner/memory'}
         (Deaf(), {'gift', 'fine', 'bribe', 'learner/memory'}),
         (Listening(), {'bribe', 'learner/memory'}),
         (Paying(cost='bribe'), {'fine', 'learner/memory'}),
-        (Replacing(cost='bribe', bonus='gift'), {'fine', 'learner/memory'}),
+        (Replacing(cost='bribe'), {'reward', 'fine', 'learner/memory'}),
         # They are not judged, so nothing has to be hidden.
         (Silent(), set()),
         (Seeing(), set()),
@@ -323,7 +335,7 @@ def test_a_defence_gets_only_the_readings_that_it_declares(
   def treat(self, given, setting, state, key):
     found.append((set(given['observation']), defences.data_of(given, setting)))
     return defences.Treated(
-        {**given, 'reading': given['reading'] - 1, 'choice': {}}, state
+        {**given, 'reading': batch['reading'] - 1, 'choice': {}}, state
     )
 
   monkeypatch.setattr(type(defence), 'treat', treat)
@@ -367,9 +379,37 @@ def test_a_reading_that_a_defence_does_not_declare_is_refused(
     assert '\n' not in text
 
 
+@pytest.mark.parametrize(
+    'weights', [{'gift': 3.0}, {'reward': 0.0, 'gift': 1.0}]
+)
+def test_a_defence_that_is_not_paid_the_reward_does_not_get_it(
+    monkeypatch, weights
+):
+  monkeypatch.setattr(Deaf, 'pays', lambda self, reward: weights)
+  guard, batch = _guard(Deaf())
+  key = np.array([1, 2], np.uint32)
+  with pytest.raises(errors.SpecError, match=r"'reading' of the shape \(\)"):
+    guard.treat(batch, 0, key)  # It returns what it was given.
+
+  def take(self, given, setting, state, key):
+    return defences.Treated({**given, 'reading': given['reading']}, state)
+
+  monkeypatch.setattr(Deaf, 'treat', take)
+  with pytest.raises(errors.SpecError, match="takes 'reading' from a batch"):
+    guard.treat(batch, 0, key)
+
+  def pay(self, given, setting, state, key):
+    assert set(given['observation']) == {'light', 'registers/gift'}
+    reading = given['observation']['registers/gift']
+    return defences.Treated({**given, 'reading': reading}, state)
+
+  monkeypatch.setattr(Deaf, 'treat', pay)
+  assert (guard.treat(batch, 0, key)['reading'] == 2.0).all()
+
+
 _SHIPPED = {
     'alarm': {'register': 'bell'},
-    'cap': {},
+    'cap': {'high': 2.0},
     'learned_reward': {},
     'mona': {'approval': 'praise', 'query': 'ask', 'weight': 4.0},
     'orpo': {'trusted': {'policy': 'random'}},

@@ -363,8 +363,12 @@ def test_a_wrong_command_is_refused_in_one_line(
         ),
         (
             {'defence': {'kind': 'alarm', 'register': 'bell'}},
-            "runs.own: learner.defence: listens to 'bell', which no provider"
-            " writes; allowed are ['reward']",
+            "runs.own: learner.defence: listens to 'bell', which is no register"
+            " that a provider writes; allowed are ['reward']",
+        ),
+        (
+            {'defence': {'kind': 'alarm', 'register': 'senses/heading'}},
+            "listens to 'senses/heading', which is no register that a provider",
         ),
     ],
 )

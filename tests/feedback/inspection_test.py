@@ -450,6 +450,11 @@ _WRONG = {
         "writes: 'alarm' holds 0.5 at most, and the learner heeds what is above"
         ' 0.5; allowed are a larger range, and a smaller learner.defence.above',
     'learner.defence.above=1': "'alarm' holds 1 at most, and the learner heeds",
+    'registers.meter.range=[0, 0.5]':
+        'registers.meter_b.range: ends at 0.5, so it never reports a sighting;'
+        ' allowed for a detector are ends above 0.5',
+    'registers.budget.initial=score':
+        'registers.budget.initial: a budget of score; allowed is at least the',
     'providers.0.penalty=-1': 'penalty: must be greater than or equal to 0',
     'meters.1.measures.of=[]': 'measures.of: must have at least 1 item',
     _ALONE % ', suspects: budget':

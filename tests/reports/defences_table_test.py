@@ -34,7 +34,7 @@ def found(tmp_path_factory):
       'b': {**_run('cap', high=3.0), 'steps': 6_000},
       'c': _run('orpo', trusted={'policy': 'random'}, gradients=5),
       'd': _run(more=_ELSEWHERE),
-      'e': _run('cap', more=_ELSEWHERE),
+      'e': _run('cap', total=4.0, more=_ELSEWHERE),
       'f': {**_run('cap', total=9.0), 'task': 'unlock_door.standard'},
       'g': {'design': 'inspected_reward', 'overrides': ['dof=planar']},
       'h': {**_run(more=_ELSEWHERE), 'learner': _GATED},

@@ -14,13 +14,16 @@ class Alarm(base.Defence):
   """Responds to the reading of a register in which tampering is reported.
 
   Attributes:
-    register_name: Name of the register; `register` in a file.
+    register_name: Name of the register, given as `register`.
     above: A larger reading is an alarm.
     response: `screen` to leave the step out of the batch; `penalty` to learn
       from a smaller reward; `fine` to learn from a negative reward instead, so
       that a small one does for any gain of the steps with an alarm.
     penalty: What is subtracted from the reward, or its size instead.
   """
+
+  # Two spellings would be two designs to digests and to checks of options.
+  model_config = pydantic.ConfigDict(populate_by_name=False)
 
   ALARMS = True
 
@@ -29,6 +32,17 @@ class Alarm(base.Defence):
   above: Annotated[float, pydantic.Field(ge=-1e9, le=1e9)] = 0.5
   response: Literal['screen', 'penalty', 'fine'] = 'screen'
   penalty: Annotated[float, pydantic.Field(ge=0, le=1e6)] = 1.0
+
+  @pydantic.model_validator(mode='after')
+  def _consistent(self) -> 'Alarm':
+    is_used = self.response != 'screen'
+    if 'penalty' in self.model_fields_set and is_used != (self.penalty > 0):
+      allowed = 'more than 0' if is_used else 'none'
+      raise ValueError(
+          f'penalty: {self.penalty:g} with response {self.response}; allowed is'
+          f' {allowed}'
+      )
+    return self
 
   @property
   def reads(self) -> tuple[str, ...]:

@@ -19,6 +19,8 @@ _Paid = Annotated[
     option_types.ModelIn(base.PROVIDERS),
     pydantic.WithJsonSchema({'type': 'object'}),
 ]
+# A larger reading of a detector is a sighting.
+_SEEN = 0.5
 # The provider that is inspected gets the key of the step itself.
 _OTHER_STREAM = np.uint64(1 << 63)
 
@@ -159,6 +161,11 @@ class Inspection(base.Provider):
             f'reads: {name!r}, whose role is {design.ports[name].role!r}, as a'
             ' detector; allowed is meter'
         )
+      if (most := design.ports[name].range[1]) <= _SEEN:
+        raise ValueError(
+            f'registers.{name}.range: ends at {most:g}, so it never reports a'
+            f' sighting; allowed for a detector are ends above {_SEEN:g}'
+        )
     self._check_alarm(design)
     budget = design.ports[name := self.reads[-1]]
     if budget.role != 'memory':
@@ -166,10 +173,12 @@ class Inspection(base.Provider):
           f'reads: {name!r}, whose role is {budget.role!r}, as the budget;'
           ' allowed is memory'
       )
-    if not isinstance(budget.initial, str) and budget.initial < self.price:
+    initial = budget.initial
+    if isinstance(initial, str) or initial < self.price:
+      given = initial if isinstance(initial, str) else f'{initial:g}'
       raise ValueError(
-          f'registers.{name}.initial: a budget of {budget.initial:g}; allowed'
-          f' is at least the price of one inspection, {self.price:g}'
+          f'registers.{name}.initial: a budget of {given}; allowed is at least'
+          f' the price of one inspection, {self.price:g}'
       )
     if budget.range[0] > 0:
       raise ValueError(
@@ -228,7 +237,9 @@ class Inspection(base.Provider):
       reading = np.array(readings[self.suspects])
       before = np.where(start, reading, state['reading'])
       asks = asks & (self._score(reading, before) > self.above)
-    seen = np.stack([readings[name] > 0.5 for name in self.detectors], axis=-1)
+    seen = np.stack(
+        [readings[name] > _SEEN for name in self.detectors], axis=-1
+    )
     if self.probability < 1 or self.false_positives or self.false_negatives:
       draws = random_keys.uniform(key + _OTHER_STREAM, (1 + seen.shape[-1],))
       asks = asks & (draws[..., 0] < self.probability)
