@@ -163,3 +163,24 @@ def test_a_learner_is_compared_with_one_of_its_kind(tmp_path, monkeypatch):
   # A gate that is not open yet has had no false alarms to give.
   assert _cells(found, 'false alarms (%)')['gated'] is None
   assert len(defences_table.worlds(found)) == 1
+
+
+def test_the_reward_learner_with_the_best_twin_is_the_yardstick(tmp_path):
+  # Listed first or not, and whatever the others are called.
+  more = {'learner': {'gamma': 0.5}}
+  plain = {name: {**_run(), **more} for name in ('a', 'b', 'c', 'd')}
+  runs = {**plain, 'capped': _run('cap', high=3.0)}
+  one = fake_sweep.experiment(
+      runs=runs, seeds=[0], baselines=[], evaluation={'episodes': 3}
+  )
+  fake_sweep.build(tmp_path / 'results', one)
+  found = {
+      each.own.run.name: each
+      for each in defences_table.entries(tmp_path / 'results')
+  }
+  earned = {
+      name: found[name].twin.summary.true_return.estimate for name in plain
+  }
+  assert max(earned, key=earned.get) != 'a'
+  assert len({*earned.values()}) > 1
+  assert earned[found['capped'].plain.run.name] == max(earned.values())
