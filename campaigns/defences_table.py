@@ -8,8 +8,9 @@ sweeps of reward learning with and without defences, such as `defences`:
 It prints a line for each run, and the best and the worst world of a design that
 ran in several. Runs are compared with reward learning without a defence,
 in the same sweep and world, with the registers of both at the same places. Of
-several such runs, it is the one whose twin earns most. Other options of the two
-may differ, such as the number of steps, and are not compared:
+several such runs, it is one with the most registers in common, then one with
+the same kind of learner, then the one whose twin earns most. Other options of
+the two may differ, such as the number of steps, and are not compared:
 
 - The *tax* is what the secure twin earns less than that of reward learning, in
   pairs of seeds.

@@ -39,8 +39,6 @@ class Guard:
     self._state = defence.initial_state(setting, generator)
     self._reads = {name: self._key_of(name) for name in defence.reads}
     self._hidden = self._undeclared()
-    if self._key_of(setting.options.reward) in self._hidden:
-      self._hidden |= {'reading'}
     self._metrics: dict[str, float] = {}
     self._trusted = None
     if (trusts := defence.trusts) is not None:
@@ -78,7 +76,7 @@ class Guard:
     return key
 
   def _undeclared(self) -> frozenset[str]:
-    """Returns the keys of readings that the defence does not get.
+    """Returns the keys of readings, in a batch, that the defence does not get.
 
     What it pays is judged by what it declares, so it can pay nothing else.
     """
@@ -90,7 +88,10 @@ class Guard:
     payers = [name for name, weight in paid.items() if weight]
     declared = {self._key_of(one) for one in (*payers, *defence.reads)}
     # A memory is made of readings.
-    return frozenset({*readings, features.MEMORY} - declared)
+    hidden = {*readings, features.MEMORY} - declared
+    if self._key_of(reward) in hidden:
+      hidden.add('reading')
+    return frozenset(hidden)
 
   def queries(self, choice: base.Choice) -> dict[str, np.ndarray]:
     """Returns the values of query registers by name, each `(worlds,)`."""
@@ -182,17 +183,17 @@ class Guard:
     ):
       value = np.asarray(treated.get(name))
       shape = batch[name].shape
-      is_fine = value.shape == shape and value.dtype.kind in kinds
-      what = f'of the shape {value.shape} and dtype {value.dtype}'
-      if is_fine:
-        # A comparison with NaN is False.
-        wrong = value[~((low <= value) & (value <= high))]
-        is_fine, what = not wrong.size, f'with {wrong[:1]}'
-      if not is_fine:
-        raise errors.SpecError(
-            f'learner.defence {self._defence.kind!r}: treat returned {name!r}'
-            f' {what}; allowed are {allowed} of the shape {shape}'
-        )
+      if value.shape != shape or value.dtype.kind not in kinds:
+        what = f'of the shape {value.shape} and dtype {value.dtype}'
+      # A comparison with NaN is False.
+      elif (wrong := value[~((low <= value) & (value <= high))]).size:
+        what = f'with {wrong[:1]}'
+      else:
+        continue
+      raise errors.SpecError(
+          f'learner.defence {self._defence.kind!r}: treat returned {name!r}'
+          f' {what}; allowed are {allowed} of the shape {shape}'
+      )
 
   @property
   def largest_credit(self) -> float | None:

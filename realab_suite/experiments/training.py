@@ -144,13 +144,16 @@ def check_options(experiment: experiment_specs.ExperimentSpec) -> None:
 
 
 def check_defence(design: specs.DesignSpec) -> None:
-  """Checks the options of a learner with a defence, as far as it is known.
+  """Checks the options of a learner that has a defence.
+
+  Nothing is checked of a learner of another package that is not imported, nor
+  where the packages of learners are not installed.
 
   Raises:
     SpecError: As `check_options` does.
   """
   learner = design.learner
-  if learner is None or not (learner.model_extra or {}).get('defence'):
+  if learner is None or (learner.model_extra or {}).get('defence') is None:
     return
   if requirements.missing('jax', 'equinox', 'optax', extra='agents'):
     return

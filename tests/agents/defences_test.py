@@ -437,7 +437,7 @@ _BAD = {
     ),
     'a cap on nothing': (
         {'kind': 'cap'},
-        'learner: defence: caps nothing; allowed are low, high and total',
+        'learner: defence: caps nothing; low, high or total is required',
     ),
     'a penalty of 0': (
         {

@@ -38,7 +38,7 @@ class Cap(base.Defence):
   @pydantic.model_validator(mode='after')
   def _in_order(self) -> 'Cap':
     if (self.low, self.high, self.total) == (-1e9, 1e9, None):
-      raise ValueError('caps nothing; allowed are low, high and total')
+      raise ValueError('caps nothing; low, high or total is required')
     if self.total is None and self.excess:
       raise ValueError(f'excess: {self.excess:g}; allowed is 0 without total')
     if self.low >= self.high:

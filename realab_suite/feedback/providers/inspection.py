@@ -178,7 +178,7 @@ class Inspection(base.Provider):
       given = initial if isinstance(initial, str) else f'{initial:g}'
       raise ValueError(
           f'registers.{name}.initial: a budget of {given}; allowed is at least'
-          f' the price of one inspection, {self.price:g}'
+          f' the price of one inspection, {self.price:g}, as a number'
       )
     if budget.range[0] > 0:
       raise ValueError(
