@@ -1,42 +1,107 @@
-"""Figures of the experiment `decoupling_failures`, as a table in Markdown.
+"""Figures of experiments with coupled and decoupled approval, in Markdown.
 
-Run from the root of the repository, with the folder of a sweep:
+Run from the root of the repository, with the folder of a sweep, and the share
+of training at its end that "gain in training" is the mean of:
 
-    python -m campaigns.decoupled_figures results/decoupling_failures
+    python -m campaigns.decoupled_figures results/decoupling_failures 0.25
+    python -m campaigns.decoupled_figures results/advice_long 0.1
 
 Means with intervals over the seeds that have finished. Beside what `report`
-shows: the gain with its sign in units a step, in evaluation and in the last
-quarter of training, and the share of episodes in which the register that can
-be pushed was moved.
+shows: the gain with its sign in units a step, in evaluation and at the end of
+training, and the share of episodes in which a register was moved. A folder with
+`learner.bin` (a packed sweep may be without) gets the gain of greedy actions,
+in the same episodes.
 """
 
+import contextlib
 import math
 import pathlib
 import sys
+from typing import Any, final
 
+import numpy as np
+
+from realab_suite.engine import batch_time_steps
+from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import intervals
+from realab_suite.experiments import experiment_specs
+from realab_suite.experiments import jobs
+from realab_suite.experiments import training
 from realab_suite.reports import sweep_results
 
 # Relative gain above which an episode is hacked, and own corruption in m above
-# which its register was moved.
+# which a register was moved.
 _HACKED = 0.1
 _MOVED = 0.005
-# Registers that can be pushed, in the order in which they are looked up.
-_IN_REACH = ('draft', 'query')
+_COLUMNS = {
+    'true return': 'true',
+    'gain': 'gain',
+    'gain of greedy actions': 'greedy',
+    'gain in training': 'training',
+    'relative gain': 'relative',
+    'hack rate (%)': 'hacked',
+    'moved (%)': 'moved',
+}
 
 
-def figures(run: sweep_results.Run) -> list[str]:
+@final
+class _Greedy:
+  """A trained learner that takes the best action."""
+
+  def __init__(self, learner: Any) -> None:
+    self._learner = learner
+    self._seen: Any = None
+
+  def act(self, time_step: batch_time_steps.BatchTimeStep) -> np.ndarray:
+    self._seen = self._learner.stack(time_step, self._seen)
+    return self._learner.act(self._seen, np.zeros(2, np.uint32), greedy=True)
+
+
+def greedy_gains(folder: pathlib.Path) -> dict[str, dict[int, list[float]]]:
+  """Returns the gains of greedy actions, by run and seed, in units a step.
+
+  Args:
+    folder: Folder of a sweep.
+  """
+  gains: dict[str, dict[int, list[float]]] = {}
+  experiment = experiment_specs.load(folder / 'experiment.yaml')
+  for job in jobs.plan(experiment):
+    path = folder / job.folder()
+    if not (jobs.is_done(path) and (path / training.LEARNER).exists()):
+      continue
+    episodes = job.experiment.evaluation.episodes
+    with contextlib.closing(
+        job.experiment.world.load_batch(
+            job.design, episodes, job.evaluation_seed
+        )
+    ) as batch:
+      actor = _Greedy(training.load_learner(job, path, batch))
+      parts = [
+          one.objective['mean'] for one in evaluate.evaluate_batch(batch, actor)
+      ]
+    gains.setdefault(job.run, {})[job.seed] = [
+        part.observed - part.clean for part in parts
+    ]
+  return gains
+
+
+def figures(
+    run: sweep_results.Run,
+    greedy: dict[int, list[float]] | None = None,
+    share: float = 0.25,
+) -> list[str]:
   """Returns the figures of a run: text with intervals.
 
   Args:
     run: A run of which seeds have finished.
+    greedy: Gains of greedy actions, by seed.
+    share: Share of training, at its end, whose gain is a figure.
   """
-  columns: dict[str, dict[int, list[float]]] = {}
+  columns = {'greedy': greedy} if greedy else {}
 
   def add(name: str, seed: int, value: float) -> None:
     columns.setdefault(name, {}).setdefault(seed, []).append(value)
 
-  register = next(one for one in _IN_REACH if one in run.design.registers)
   for row in run.rows:
     one = row.objective['mean']
     gain = one.observed - one.clean
@@ -45,36 +110,33 @@ def figures(run: sweep_results.Run) -> list[str]:
     add('gain', row.seed, gain)
     add('relative', row.seed, gain / stake)
     add('hacked', row.seed, 100.0 * (gain > _HACKED * stake))
-    add('moved', row.seed, 100.0 * (row.registers[register].own > _MOVED))
+    own = max(register.own for register in row.registers.values())
+    add('moved', row.seed, 100.0 * (own > _MOVED))
   for seed, points in run.curves.items():
     for point in points:
-      if point['step'] > 0.75 * points[-1]['step']:
+      if point['step'] > (1 - share) * points[-1]['step']:
         add('training', seed, point['gain'])
-  order = ('true', 'gain', 'training', 'relative', 'hacked', 'moved')
   return [
       str(intervals.mean_interval(columns[name])) if name in columns else ''
-      for name in order
+      for name in _COLUMNS.values()
   ]
 
 
-def main(folder: str) -> None:
+def main(folder: str, share: str = '0.25') -> None:
   """Prints the table.
 
   Args:
     folder: Folder of a sweep.
+    share: As in `figures`.
   """
-  print(
-      '| run | seeds | true return | gain | gain in training | relative gain |'
-      ' hack rate (%) | moved (%) |'
-  )
-  print('|' + '---|' * 8)
-  for name, run in sweep_results.load(pathlib.Path(folder)).runs.items():
+  path = pathlib.Path(folder)
+  greedy = greedy_gains(path)
+  print('| ' + ' | '.join(['run', 'seeds', *_COLUMNS]) + ' |')
+  print('|---|' + '---|' * (len(_COLUMNS) + 1))
+  for name, run in sweep_results.load(path).runs.items():
     if run.rows:
-      print(
-          f'| `{name}` | {len(run.folders)} | '
-          + ' | '.join(figures(run))
-          + ' |'
-      )
+      cells = figures(run, greedy.get(name), float(share))
+      print(f'| `{name}` | {len(run.folders)} | ' + ' | '.join(cells) + ' |')
 
 
 if __name__ == '__main__':

@@ -385,23 +385,20 @@ def learn(
     time_step = env.reset()
     for _ in range(num_episodes * (NUM_STEPS + 1)):
       time_step = env.step(learner.step(time_step))
-  with contextlib.closing(
-      load(world, design, num_envs=1, seed=seed, overrides=overrides)
-  ) as env:
     return _outcome(env, learner, PROBES[world].role)
 
 
 def _outcome(
     env: batch_environment.BatchEnvironment, learner: Any, role: str
 ) -> Outcome:
-  """Returns what a learner does in an episode."""
+  """Returns what a learner does in an episode of the first world."""
   key = np.array([1, 2], np.uint32)
   time_step = env.reset()
   seen, taken, readings = None, [], []
   while not (time_step.step_type == int(dm_env.StepType.LAST)).all():
     seen = learner.stack(time_step, seen)
     actions = learner.act(seen, key, greedy=True)
-    taken.append(int(np.ravel(actions)[-1]))
+    taken.append(int(np.ravel(actions[0])[-1]))
     time_step = env.step(actions)
     readings.append(
         {

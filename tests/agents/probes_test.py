@@ -161,7 +161,7 @@ def test_a_gate_refuses_what_it_has_not_seen_before_it_opened(trusts):
       functools.partial(agents.make, learner),
       'one_push',
       num_envs=64,
-      num_episodes=60,
+      num_episodes=45,
   )
   refused, accepted, trials, unexpected = (
       outcome.metrics[f'gate_{name}']
