@@ -5,7 +5,7 @@ A checkpoint contains the full state; lines that were written after it are
 removed.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 import contextlib
 import dataclasses
 import os
@@ -29,7 +29,6 @@ from realab_suite.evaluation import monitors
 from realab_suite.evaluation import results
 from realab_suite.evaluation import traces
 from realab_suite.experiments import curves
-from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
 from realab_suite.experiments import kept_stakes
 from realab_suite.experiments import machines
@@ -125,22 +124,34 @@ def run(job: jobs.Job, output: pathlib.Path, options: Options) -> pathlib.Path:
   return path
 
 
-def check_options(experiment: experiment_specs.ExperimentSpec) -> None:
-  """Checks the options of learners, before any of them is made.
+def rehearse(planned: Iterable[jobs.Job]) -> None:
+  """Makes the learner of each run once, before any job starts.
 
-  Nothing is checked where the packages of learners are not installed.
+  So a trusted policy of other actions is refused at once, and not hours later,
+  when its job starts. Nothing is checked where the packages of learners are not
+  installed; of runs that learn from data, only the options are.
+
+  Args:
+    planned: Jobs to run.
 
   Raises:
-    SpecError: If a learner is unknown, an option is invalid, or a defence
-      listens to anything but a register that a provider writes.
+    SpecError: If a learner is unknown, an option is invalid, a defence listens
+      to anything but a register that a provider writes, or a learner does not
+      fit its worlds.
   """
   if requirements.missing('jax', 'equinox', 'optax', extra='agents'):
     return
-  for name, design in experiment.designs.items():
+  for job in {job.run: job for job in planned if not job.policy}.values():
     try:
-      _check_learner(design)
+      _check_learner(job.design)
+      if job.data is None:
+        world = job.experiment.training_world
+        with contextlib.closing(
+            world.load_batch(job.design, job.training.num_envs, 0)
+        ) as batch:
+          make_learner(job, batch)
     except errors.SpecError as error:
-      raise errors.SpecError(f'runs.{name}: {error}') from error
+      raise errors.SpecError(f'runs.{job.run}: {error}') from error
 
 
 def check_defence(design: specs.DesignSpec) -> None:
@@ -150,7 +161,7 @@ def check_defence(design: specs.DesignSpec) -> None:
   where the packages of learners are not installed.
 
   Raises:
-    SpecError: As `check_options` does.
+    SpecError: As `rehearse` does.
   """
   learner = design.learner
   if learner is None or (learner.model_extra or {}).get('defence') is None:
@@ -167,7 +178,7 @@ def _check_learner(design: specs.DesignSpec) -> None:
   """Refuses invalid options, and a defence that hears nothing.
 
   Raises:
-    SpecError: As `check_options` does.
+    SpecError: As `rehearse` does.
   """
   from realab_suite import agents  # Imports JAX.
 
@@ -189,7 +200,7 @@ def make_learner(
 
   Raises:
     SpecError: If the kind of learner does not exist, it does not fit the
-      design, or packages of learners are not installed; or as `check_options`.
+      design, or packages of learners are not installed; or as `rehearse`.
   """
   if problem := requirements.missing('jax', 'equinox', 'optax', extra='agents'):
     raise errors.SpecError(f'learner {job.kind!r}: {problem}')

@@ -58,15 +58,26 @@ def main() -> None:
   # Imports numerical libraries, so the number of threads has to be set first.
   from realab_suite.experiments import engines
   from realab_suite.experiments import experiment_specs
+  from realab_suite.experiments import jobs
   from realab_suite.experiments import progress
   from realab_suite.experiments import scheduler
+  from realab_suite.experiments import storage
   from realab_suite.experiments import training
 
   flags.load_imports()
   experiment = experiment_specs.load(name)
   if _ON_TASK.value is not None:
     experiment = experiment.on_task(_ON_TASK.value)
-  training.check_options(experiment)
+  folder, only = pathlib.Path(output), _RUNS.value
+  seeds = (
+      experiment.calibration_seeds if _CALIBRATION.value else experiment.seeds
+  )
+  planned = jobs.plan(experiment, seeds, only)
+  training.rehearse(
+      job
+      for job in planned
+      if not (folder / job.folder() / storage.DONE).exists()
+  )
   if flags.TENSORBOARD.value:
     progress.check_tensorboard()
   arguments = flags.import_arguments()
@@ -75,10 +86,10 @@ def main() -> None:
   engine = engines.ENGINES[_ENGINE.value](_WORKERS.value or os.cpu_count() or 1)
   scheduler.sweep(
       experiment,
-      pathlib.Path(output),
+      folder,
       engine,
       program.say,
-      only=_RUNS.value,
+      only=only,
       calibration=_CALIBRATION.value,
       arguments=arguments,
   )

@@ -370,6 +370,16 @@ def test_a_wrong_command_is_refused_in_one_line(
             {'defence': {'kind': 'alarm', 'register': 'senses/heading'}},
             "listens to 'senses/heading', which is no register that a provider",
         ),
+        (
+            {
+                'defence': {
+                    'kind': 'orpo',
+                    'trusted': {'policy': 'apple_seeker'},
+                }
+            },
+            "runs.own: learner.defence.trusted.policy 'apple_seeker': has the"
+            ' actions of',
+        ),
     ],
 )
 def test_a_wrong_option_of_a_learner_is_refused_before_anything_is_trained(
