@@ -27,6 +27,7 @@ from realab_suite.agents import features
 from realab_suite.agents import networks
 from realab_suite.agents import on_policy
 from realab_suite.agents import training
+from realab_suite.config import validation
 
 
 class ApprovalOptions(on_policy.OnPolicyOptions):
@@ -65,7 +66,7 @@ class ApprovalOptions(on_policy.OnPolicyOptions):
   exploration: base.Fraction = 0.05
   exploration_steps: base.Positive = 200_000
   floor: base.Fraction = 0.0
-  query_delay: Literal[0, 1] = 0
+  query_delay: validation.ZeroOrOne = 0
 
   @pydantic.model_validator(mode='after')
   def _without_floor(self) -> 'ApprovalOptions':

@@ -25,15 +25,22 @@ _NOT_IN_FILES = ('needs_python_object', 'dataclass_type')
 _Model = TypeVar('_Model', bound=pydantic.BaseModel)
 
 
-def _refuse_equal_values(value: Any) -> Any:
+def _integers(allowed: str) -> pydantic.BeforeValidator:
   """Refuses `true` and `1.0`, which are equal to 1 in Python."""
-  if type(value) is not int:
-    raise ValueError('must be 1')
-  return value
+
+  def check(value: Any) -> Any:
+    if type(value) is not int:
+      raise ValueError(f'must be {allowed}')
+    return value
+
+  return pydantic.BeforeValidator(check)
 
 
-Schema = Annotated[Literal[1], pydantic.BeforeValidator(_refuse_equal_values)]
+Schema = Annotated[Literal[1], _integers('1')]
 """Version of the format of a file."""
+
+ZeroOrOne = Annotated[Literal[0, 1], _integers('0 or 1')]
+"""A number of steps, such as a delay."""
 
 
 class Model(pydantic.BaseModel, abc.ABC):

@@ -329,6 +329,10 @@ def test_an_unused_query_is_zero():
             {'kind': 'value_advice', **_ADVISED, 'query_delay': 2},
             'learner: query_delay: must be 0 or 1, got 2',
         ),
+        (
+            {'kind': 'value_advice', **_ADVISED, 'query_delay': True},
+            'learner: query_delay: must be 0 or 1, got True',
+        ),
     ],
 )
 def test_a_wrong_learner_is_refused_in_one_line(spec, problem):

@@ -80,6 +80,7 @@ _WRONG_ADVICE = {
         "policy 'no_opp' is unknown; did you mean 'no_op'?",
     'providers.0.value_function=oracle': "value function 'oracle' is unknown",
     'providers.0.query_delay=2': 'query_delay: must be 0 or 1, got 2',
+    'providers.0.query_delay=true': 'query_delay: must be 0 or 1, got True',
     'providers.0.query_delay=1 & learner={kind: value_advice, advice: reward}':
         'query_delay: 1 evaluates the query of the previous step, but the'
         ' learner value_advice expects the value',

@@ -4,6 +4,7 @@ from typing import Any, Literal, final
 
 import numpy as np
 
+from realab_suite.config import validation
 from realab_suite.feedback.providers import advice
 from realab_suite.feedback.providers import base
 from realab_suite.feedback.providers import queries
@@ -29,7 +30,7 @@ class ValueAdvice(advice.Advice):
 
   kind: Literal['value_advice'] = 'value_advice'
   reads: base.OneName
-  query_delay: Literal[0, 1] = 0
+  query_delay: validation.ZeroOrOne = 0
 
   @property
   def delay(self) -> int:
