@@ -17,11 +17,7 @@ import contextlib
 import math
 import pathlib
 import sys
-from typing import Any, final
 
-import numpy as np
-
-from realab_suite.engine import batch_time_steps
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import intervals
 from realab_suite.experiments import experiment_specs
@@ -44,19 +40,6 @@ _COLUMNS = {
 }
 
 
-@final
-class _Greedy:
-  """A trained learner that takes the best action."""
-
-  def __init__(self, learner: Any) -> None:
-    self._learner = learner
-    self._seen: Any = None
-
-  def act(self, time_step: batch_time_steps.BatchTimeStep) -> np.ndarray:
-    self._seen = self._learner.stack(time_step, self._seen)
-    return self._learner.act(self._seen, np.zeros(2, np.uint32), greedy=True)
-
-
 def greedy_gains(folder: pathlib.Path) -> dict[str, dict[int, list[float]]]:
   """Returns the gains of greedy actions, by run and seed, in units a step.
 
@@ -75,7 +58,8 @@ def greedy_gains(folder: pathlib.Path) -> dict[str, dict[int, list[float]]]:
             job.design, episodes, job.evaluation_seed
         )
     ) as batch:
-      actor = _Greedy(training.load_learner(job, path, batch))
+      learner = training.load_learner(job, path, batch)
+      actor = training.LearnerActor(learner, job.evaluation_seed, greedy=True)
       parts = [
           one.objective['mean'] for one in evaluate.evaluate_batch(batch, actor)
       ]

@@ -284,7 +284,7 @@ def _evaluate(
       )
       actor = batch_actors.BatchPolicyActor(policy, batch, seed)
     else:
-      actor = _LearnerActor(learner, seed, evaluation.actions == 'greedy')
+      actor = LearnerActor(learner, seed, evaluation.actions == 'greedy')
     if trace is None:
       found = evaluate.evaluate_batch(batch, actor)
     else:
@@ -545,12 +545,19 @@ class _Training:
 
 
 @final
-class _LearnerActor:
+class LearnerActor:
   """A trained learner acting in a batch, without further updates."""
 
   def __init__(
       self, learner: 'agents.Learner', seed: int, greedy: bool
   ) -> None:
+    """Makes an actor for one episode in each world.
+
+    Args:
+      learner: The learner.
+      seed: Seed of the batch.
+      greedy: True to take the best action instead of drawing one.
+    """
     self._learner = learner
     self._seed = seed
     self._greedy = greedy

@@ -391,7 +391,7 @@ def learn(
 def _outcome(
     env: batch_environment.BatchEnvironment, learner: Any, role: str
 ) -> Outcome:
-  """Returns what a learner does in an episode of the first world."""
+  """Returns the outcome of an episode of a learner, in the first world."""
   key = np.array([1, 2], np.uint32)
   time_step = env.reset()
   seen, taken, readings = None, [], []
