@@ -209,7 +209,7 @@ def test_a_learner_resumes_within_an_episode_bit_for_bit(kind):
 def test_evaluation_sees_what_training_sees(kind, monkeypatch):
   env = Motion(6)
   learner = _make(env, kind, frame_stack=3, steps_per_update=1000)
-  actor = training._LearnerActor(learner, 0, greedy=False)
+  actor = training.LearnerActor(learner, 0, greedy=False)
   seen = []
   choose = learner._choose
 

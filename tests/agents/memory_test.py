@@ -50,7 +50,7 @@ def _train(learner: agents.Learner, env: toys.Recall, num_steps: int) -> Any:
 
 def _recalled(learner: agents.Learner, env: toys.Recall) -> float:
   """Returns the share of worlds with the right answer, acting greedily."""
-  actor = training._LearnerActor(learner, 0, greedy=True)
+  actor = training.LearnerActor(learner, 0, greedy=True)
   time_step = env.reset()
   for _ in range(2 * env.wait + 3):
     time_step = env.step(actor.act(time_step))
@@ -128,7 +128,7 @@ def test_a_learner_with_a_memory_resumes_bit_for_bit():
 def test_evaluation_remembers_what_training_remembers(monkeypatch):
   env = toys.Recall(10, phases=5)
   learner = _make(env, memory=4, steps_per_update=1000)
-  actor = training._LearnerActor(learner, 0, greedy=False)
+  actor = training.LearnerActor(learner, 0, greedy=False)
   seen = []
   choose = learner._choose
 
