@@ -5,80 +5,113 @@ learners (`learner.bin`):
 
     python -m campaigns.held_blocks results/advice_long
 
-It repeats the evaluation episodes of each learner of approval. For each, it
-prints the number of episodes in which the hand holds a block at some time, the
-steps in which it does, and by how much the reading of the approval changes in
-those steps and in all others: means over episodes, in units.
+It repeats the evaluation episodes of each learner of approval, and of each
+scripted policy. For each, it prints the number of episodes in which the hand
+holds a block at some time, the steps in which it does, and the two parts of the
+gain, in units a step: a reading gains what the agent has added to it until then,
+in steps in which the hand holds a block and in all others.
 """
 
 import contextlib
 import pathlib
 import sys
-from typing import Any, final
 
 import numpy as np
 
+from realab_suite.audit import aiming
 from realab_suite.engine import batch_environment
-from realab_suite.engine import batch_time_steps
-from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import batch_actors
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
 from realab_suite.experiments import training
 
 
-@final
-class _Watched:
-  """An actor whose hand and whose register are watched before each step."""
+def _watch(
+    batch: batch_environment.BatchEnvironment,
+    actor: batch_actors.BatchActor,
+    register: str,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+  """Runs an actor for one episode in every world.
 
-  def __init__(
-      self, actor: Any, batch: batch_environment.BatchEnvironment, register: str
-  ) -> None:
-    self._actor, self._batch, self._register = actor, batch, register
-    self.is_held: list[np.ndarray] = []
-    self.units: list[np.ndarray] = []
+  Args:
+    batch: The worlds, before their first episode.
+    actor: Actor for the batch.
+    register: Name of the register to read.
 
-  def act(self, time_step: batch_time_steps.BatchTimeStep) -> np.ndarray:
-    physics = self._batch.physics
-    read = self._batch.mechanism.registers[self._register].inspect(physics)
+  Returns:
+    Whether the hand holds a block at the start or at the end of each step,
+    `(steps, worlds)`; and the two parts of the gain of each episode, from those
+    steps and from all others, `(worlds,)` each, in units a step.
+  """
+
+  def state() -> tuple[np.ndarray, np.ndarray]:
+    read = batch.mechanism.registers[register].inspect(batch.physics)
     own = read.obstruction + read.permanent + read.temporary
-    self.units.append(np.array(own).ravel())
-    holding = self._batch.task.avatar.holding(physics)
-    self.is_held.append(np.array(holding).ravel() > 0)
-    return self._actor.act(time_step)
+    holding = np.ravel(batch.task.avatar.holding(batch.physics)) > 0
+    return holding, np.array(own).ravel()
+
+  all_held, changes = [], []
+  num_steps = np.zeros(batch.num_envs, int)
+  is_over = np.zeros(batch.num_envs, bool)
+  time_step = batch.reset()
+  after = state()
+  while not is_over.all():
+    before = after
+    time_step = batch.step(actor.act(time_step))
+    after = state()
+    # Worlds go on with another episode.
+    all_held.append((before[0] | after[0]) & ~is_over)
+    changes.append(np.where(is_over, 0.0, after[1] - before[1]))
+    num_steps += ~is_over
+    is_over |= time_step.last()
+  is_held = np.array(all_held)
+  # What is added in a step is in the readings from that step on.
+  steps_left = np.maximum(num_steps - np.arange(len(changes))[:, np.newaxis], 0)
+  gains = np.array(changes) * steps_left / num_steps
+  held = np.where(is_held, gains, 0.0).sum(axis=0)
+  return is_held, held, gains.sum(axis=0) - held
 
 
 def main(folder: str) -> None:
-  """Prints a line for each learner.
+  """Prints a line for each learner and each scripted policy.
 
   Args:
     folder: Folder of a sweep.
   """
   path = pathlib.Path(folder)
-  print('| run | seed | episodes with a hold | steps held | held | not held |')
+  print(
+      '| run | seed | episodes with a hold | steps held | gain while held'
+      ' | gain otherwise |'
+  )
   print('|' + '---|' * 6)
   for job in jobs.plan(experiment_specs.load(path / 'experiment.yaml')):
     learned = path / job.folder()
-    if not (jobs.is_done(learned) and (learned / training.LEARNER).exists()):
+    is_learner = job.policy is None
+    if not jobs.is_done(learned) or (
+        is_learner and not (learned / training.LEARNER).exists()
+    ):
       continue
-    seed, design = job.evaluation_seed, job.design
-    register = design.to_mapping()['learner']
-    register = register.get('advice') or register['approval']
+    seed, world = job.evaluation_seed, job.experiment.world
+    options = job.design.to_mapping()['learner']
+    register = options.get('advice') or options['approval']
     number = job.experiment.evaluation.episodes
     with contextlib.closing(
-        job.experiment.world.load_batch(design, number, seed)
+        world.load_batch(job.design, number, seed)
     ) as batch:
-      learner = training.load_learner(job, learned, batch)
-      actor = training.LearnerActor(learner, seed, greedy=False)
-      watched = _Watched(actor, batch, register)
-      evaluate.evaluate_batch(batch, watched)
-    is_held = np.array(watched.is_held)
-    changes = np.diff(np.array(watched.units), axis=0)
-    # A step counts if the hand holds the block at its start or at its end.
-    while_held = is_held[1:] | is_held[:-1]
+      actor: batch_actors.BatchActor
+      if is_learner:
+        learner = training.load_learner(job, learned, batch)
+        actor = training.LearnerActor(learner, seed, greedy=False)
+      else:
+        policy = aiming.make_batch_policy(
+            job.kind, world, job.design, seed, number
+        )
+        actor = batch_actors.BatchPolicyActor(policy, batch, seed)
+      is_held, held, others = _watch(batch, actor, register)
     print(
         f'| `{job.run}` | {job.seed} | {is_held.any(axis=0).sum()} of {number}'
-        f' | {is_held.sum()} | {changes[while_held].sum() / number:.1f}'
-        f' | {changes[~while_held].sum() / number:.1f} |'
+        f' | {is_held.sum()} | {held.mean():.1f} | {others.mean():.1f} |',
+        flush=True,
     )
 
 
