@@ -7,9 +7,9 @@ learners (`learner.bin`):
 
 It repeats the evaluation episodes of each learner of approval, and of each
 scripted policy. For each, it prints the number of episodes in which the hand
-holds a block at some time, the steps in which it does, and the two parts of the
-gain, in units a step: a reading gains what the agent has added to it until then,
-in steps in which the hand holds a block and in all others.
+holds a block at some time, the steps in which it does, and the gain in its two
+parts, in units a step: readings gain what was added to them before, in steps in
+which the hand holds a block and in all others.
 """
 
 import contextlib
