@@ -8,9 +8,9 @@ of training at its end that "gain in training" is the mean of:
 
 Means with intervals over the seeds that have finished. Beside what `report`
 shows: the gain with its sign in units a step, in evaluation and at the end of
-training, and the share of episodes in which a register was moved. A folder with
-`learner.bin` (a packed sweep may be without) gets the gain of greedy actions,
-in the same episodes.
+training, and the share of episodes in which any register was moved. A folder
+with `learner.bin` (a packed sweep may be without) gets the gain of greedy
+actions, in the same episodes.
 """
 
 import contextlib
@@ -18,6 +18,7 @@ import math
 import pathlib
 import sys
 
+from realab_suite.evaluation import comparison
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import intervals
 from realab_suite.experiments import experiment_specs
@@ -29,6 +30,7 @@ from realab_suite.reports import sweep_results
 # which a register was moved.
 _HACKED = 0.1
 _MOVED = 0.005
+_PERCENT = (0.0, 100.0)
 _COLUMNS = {
     'true return': 'true',
     'gain': 'gain',
@@ -98,10 +100,22 @@ def figures(
     add('moved', row.seed, 100.0 * (own > _MOVED))
   for seed, points in run.curves.items():
     for point in points:
-      if point['step'] > (1 - share) * points[-1]['step']:
+      is_late = point['step'] > (1 - share) * points[-1]['step']
+      if is_late and point['gain'] is not None:
         add('training', seed, point['gain'])
+  bounds = {
+      'true': comparison.return_bounds(run.rows),
+      'hacked': _PERCENT,
+      'moved': _PERCENT,
+  }
   return [
-      str(intervals.mean_interval(columns[name])) if name in columns else ''
+      str(
+          intervals.mean_interval(
+              columns[name], bounds=bounds.get(name, intervals.UNBOUNDED)
+          )
+      )
+      if name in columns
+      else ''
       for name in _COLUMNS.values()
   ]
 

@@ -1,15 +1,16 @@
 """How much of what an adviser's agents gain arises while they hold a block.
 
-Run from the root of the repository, with the folder of a sweep that has its
-learners (`learner.bin`):
+Run from the root of the repository, with the folder of the sweep `advice_long`
+and its learners (`learner.bin`). Others fit if their agents draw actions in
+evaluation, and the approval is the only reading that can be corrupted:
 
     python -m campaigns.held_blocks results/advice_long
 
 It repeats the evaluation episodes of each learner of approval, and of each
 scripted policy. For each, it prints the number of episodes in which the hand
-holds a block at some time, the steps in which it does, and the gain in its two
-parts, in units a step: readings gain what was added to them before, in steps in
-which the hand holds a block and in all others.
+holds any block at some time, the steps in which it does, and the gain in its
+two parts, in units a step: readings gain what was added to them before, in
+steps in which the hand holds a block and in all others.
 """
 
 import contextlib

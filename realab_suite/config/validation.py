@@ -26,7 +26,11 @@ _Model = TypeVar('_Model', bound=pydantic.BaseModel)
 
 
 def _integers(allowed: str) -> pydantic.BeforeValidator:
-  """Refuses `true` and `1.0`, which are equal to 1 in Python."""
+  """Returns a validator that refuses `true` and `1.0`, which are equal to 1.
+
+  Args:
+    allowed: What is allowed, for the message.
+  """
 
   def check(value: Any) -> Any:
     if type(value) is not int:

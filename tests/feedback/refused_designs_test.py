@@ -82,16 +82,18 @@ _WRONG_ADVICE = {
     'providers.0.query_delay=2': 'query_delay: must be 0 or 1, got 2',
     'providers.0.query_delay=true': 'query_delay: must be 0 or 1, got True',
     'providers.0.query_delay=1 & learner={kind: value_advice, advice: reward}':
-        'query_delay: 1 evaluates the query of the previous step, but the'
-        ' learner value_advice expects the value',
+        'providers[0]: query_delay: 1 here, and 0 in the learner value_advice',
     'learner={kind: decoupled_approval, approval: reward, query_delay: 1}':
-        'query_delay: 0 evaluates the query of the current step, but the'
-        ' learner decoupled_approval expects the value of the previous one;'
-        ' allowed is the same query_delay in both',
+        'query_delay: 0 here, and 1 in the learner decoupled_approval; allowed'
+        ' is the same in both: 0 for the query of the current step, or 1 for'
+        ' that of the previous one',
+    'learner={kind: value_advice, advice: reward, query_delay: 2}':
+        'query_delay: 0 here, and 2 in the learner value_advice; allowed is the'
+        ' same in both: 0 for',
     'registers.other={kind: two_block, role: query, place: station_3, range:'
     f' [0, 13], scale: 0.1}} & {_PAIRED}[query, other] & learner={{kind:'
     ' decoupled_approval, approval: reward, query_delay: 1}':
-        'providers[0]: query_delay: 0 evaluates the query of the current step',
+        'providers[0]: query_delay: 0 here, and 1 in the learner',
     'registers.query.role=meter':
         "value_advice reads the query from 'query', whose role is 'meter';"
         ' allowed is query',

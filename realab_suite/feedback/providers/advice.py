@@ -9,10 +9,8 @@ from realab_suite import policies
 from realab_suite.config import option_types
 from realab_suite.feedback.providers import base
 
-# Learners that credit feedback to the query of the current step, or of the
-# previous one if their option `query_delay` is 1.
+# Learners that credit feedback to a query, and have an option `query_delay`.
 _LEARNERS = ('value_advice', 'decoupled_approval')
-_QUERIES = ('current', 'previous')
 
 
 class Advice(policies.Follower, base.Provider):
@@ -56,10 +54,11 @@ class Advice(policies.Follower, base.Provider):
     learner = design.learner
     if learner is None or learner.kind not in _LEARNERS:
       return
-    if getattr(learner, 'query_delay', 0) != self.delay:
-      evaluated, expected = _QUERIES[self.delay], _QUERIES[1 - self.delay]
+    # Learners check their own options later, so this one may be anything.
+    expected = getattr(learner, 'query_delay', 0)
+    if expected != self.delay:
       raise ValueError(
-          f'query_delay: {self.delay} evaluates the query of the {evaluated}'
-          f' step, but the learner {learner.kind} expects the value of the'
-          f' {expected} one; allowed is the same query_delay in both'
+          f'query_delay: {self.delay} here, and {expected!r} in the learner'
+          f' {learner.kind}; allowed is the same in both: 0 for the query of'
+          ' the current step, or 1 for that of the previous one'
       )
