@@ -1,4 +1,4 @@
-"""How much of what an adviser's agents gain arises while they hold a block.
+"""Gains of approval learners while they hold a block, and otherwise.
 
 Run from the root of the repository, with the folder of the sweep `advice_long`
 and its learners (`learner.bin`). Others fit if their agents draw actions in
@@ -60,7 +60,7 @@ def _watch(
     before = after
     time_step = batch.step(actor.act(time_step))
     after = state()
-    # Worlds go on with another episode.
+    # A world begins another episode when its own is over.
     all_held.append((before[0] | after[0]) & ~is_over)
     changes.append(np.where(is_over, 0.0, after[1] - before[1]))
     num_steps += ~is_over
