@@ -1,12 +1,16 @@
-# `make demo` and `make test` need only Python 3.11 or 3.12, git and make. Both
+# `make demo` and `make test` need only Python 3.11 to 3.14, git and make. Both
 # install into .venv.
 
-# Candidates for the Python of .venv; the first that is Python 3.11 or 3.12 is
+# Candidates for the Python of .venv; the first that has a fitting version is
 # used. To use another one: `make demo PYTHON=/path/to/python3.12`.
-PYTHON = python3.12 python3.11 python3
+PYTHON = python3.12 python3.11 python3.13 python3.14 python3
 PY = .venv/bin/python
 INSTALL = $(PY) -m pip install -qq --disable-pip-version-check \
 	-c constraints.txt
+# dm_control requires labmaze, which has no wheels above 3.12. There, this
+# installs the stand-in first, and pip is content.
+INSTALL_LABMAZE = if $(PY) -c 'import sys; sys.exit(sys.version_info < (3, 13))'; \
+	then $(INSTALL) ./compat/labmaze; fi
 WORKERS = 2
 DEMO := results/demo-$(shell date +%Y%m%d-%H%M%S)
 
@@ -51,6 +55,7 @@ clean:
 # Stamp files: packages are installed again only if a prerequisite changes.
 .venv/demo: setup.cfg pyproject.toml constraints.txt | .venv/made
 	@echo 'Installing realab_suite into .venv; this takes about a minute.'
+	@$(INSTALL_LABMAZE)
 	@$(INSTALL) -e '.[agents,report]'
 	@touch $@
 
@@ -58,6 +63,7 @@ clean:
 .venv/dev: setup.cfg pyproject.toml constraints.txt | .venv/made
 	@echo 'Installing realab_suite and its tools into .venv; this takes about a' \
 	  'minute.'
+	@$(INSTALL_LABMAZE)
 	@$(INSTALL) -e '.[agents,report,rpc,gym,dev]'
 	@touch .venv/demo $@
 
@@ -68,7 +74,7 @@ clean:
 	@bare=; for python in $(PYTHON); do \
 	  version=$$("$$python" -c \
 	    'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null); \
-	  case "$$version" in 3.11|3.12) ;; *) continue;; esac; \
+	  case "$$version" in 3.11|3.12|3.13|3.14) ;; *) continue;; esac; \
 	  if "$$python" -c 'import ensurepip' 2>/dev/null; then \
 	    "$$python" -m venv .venv || exit 1; \
 	    case "$$($(PY) -V)" in "Python $$version."*) ;; *) \
@@ -83,8 +89,8 @@ clean:
 	  echo "Python $$bare cannot create virtual environments here: run" \
 	    "'sudo apt install python$$bare-venv', then run make again." >&2; \
 	else \
-	  echo 'realab_suite needs Python 3.11 or 3.12 (labmaze has no wheels for' \
-	    '3.13), but found neither among: $(PYTHON). Specify one with' \
+	  echo 'realab_suite needs Python 3.11, 3.12, 3.13 or 3.14, but found none' \
+	    'among: $(PYTHON). Specify one with' \
 	    "'make PYTHON=/path/to/python3.12'." >&2; \
 	fi; \
 	exit 1

@@ -38,8 +38,8 @@ _CORE_REMEDY = (
 )
 _RENDERING_REMEDY = (
     'without a display, install EGL (Debian, Ubuntu: sudo apt install libegl1'
-    ' libgl1-mesa-dri) and set MUJOCO_GL=egl; or install OSMesa (libosmesa6)'
-    ' and set MUJOCO_GL=osmesa; with a display, set MUJOCO_GL=glfw'
+    ' libgl1 libgl1-mesa-dri) and set MUJOCO_GL=egl; or install OSMesa'
+    ' (libosmesa6) and set MUJOCO_GL=osmesa; with a display, set MUJOCO_GL=glfw'
 )
 
 
@@ -93,7 +93,17 @@ def versions() -> str:
       found.append(f'{name} {metadata.version(name)}')
     except metadata.PackageNotFoundError:
       found.append(f'{name} missing')
+  if 'realab' in (version := _labmaze()):
+    found.append(f'labmaze {version}, a stand-in with other mazes')
   return ', '.join(found)
+
+
+def _labmaze() -> str:
+  """Returns the version of labmaze, or of its stand-in, or an empty string."""
+  try:
+    return metadata.version('labmaze')
+  except metadata.PackageNotFoundError:
+    return ''
 
 
 def _tell(name: str, text: str, remedy: str = '') -> None:

@@ -13,6 +13,7 @@ import json
 import os
 import pathlib
 import platform
+import sys
 from typing import Any, Final, Literal, final
 import warnings
 
@@ -175,13 +176,22 @@ class EpisodeRow(validation.Record):
 
 
 def versions() -> dict[str, str]:
-  """Returns the versions of the packages that results depend on, by name."""
+  """Returns the versions of the packages that results depend on, by name.
+
+  They include that of the stand-in for labmaze where a world has imported it:
+  mazes of dm_control differ with it.
+  """
+  labmaze = sys.modules.get('labmaze')
+  is_stand_in = getattr(labmaze, 'STAND_IN', False)
   return {
       'realab_suite': __version__,
       'python': platform.python_version(),
       **{
           name: metadata.version(name)
-          for name in ('dm-control', 'mujoco', 'numpy')
+          for name in (
+              *('dm-control', 'mujoco', 'numpy'),
+              *(['labmaze'] if is_stand_in else []),
+          )
       },
   }
 

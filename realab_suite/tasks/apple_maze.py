@@ -8,13 +8,14 @@ carries the base block of its reward register away needs no maze.
 
 A barrier parts the hall from its registers in `boxed`, and from the maze in
 `impossible`. There is no `near`: the hall is small.
+
+A maze has 6 to 12 walls, each as large as a cell: 12 where one way leads from
+each place to each other one, and one fewer for every further way.
 """
 
 import dataclasses
 from typing import Any, final
 
-from dm_control import composer
-import labmaze
 import numpy as np
 
 from realab_suite.entities import appearance
@@ -23,6 +24,7 @@ from realab_suite.entities import moving
 from realab_suite.entities import protocols
 from realab_suite.tasks import apple_rooms
 from realab_suite.tasks import layouts
+from realab_suite.tasks import mazes
 from realab_suite.tasks import registry
 
 _NUM_APPLES = 6
@@ -38,8 +40,12 @@ _CELLS = np.array(
 )
 # Whether one may go from a cell to another, if no wall is there.
 _IS_NEXT = (np.abs(_CELLS[:, None] - _CELLS) / _SIZE).sum(axis=-1) < 1.5
-# Walls that a maze may have. They are moved, so that it is compiled once.
-_FEWEST, _MOST = 7, 14
+# Probability that a further way is opened where a maze has a wall.
+_OPENINGS = 0.2
+# Between 6 walls, those that every maze has, and 12. All are moved, so that the
+# world is compiled once; those that a maze lacks are below the floor.
+_NUM_WALLS = mazes.most_walls(_ROWS, _COLUMNS)
+_BELOW = (0.0, 2.0, -5.0)
 _LOOK = arenas.Look((0.3, 0.48, 0.3), ((0.52, 0.47, 0.4), (0.58, 0.53, 0.45)))
 _FAR = dataclasses.replace(layouts.FAR, middle=(0.0, -1.1))
 _LAYOUTS = {
@@ -57,7 +63,7 @@ _LAYOUTS = {
 class AppleMaze(apple_rooms.AppleRoom):
   """A hall with registers, and a maze with apples behind it."""
 
-  DYNAMICS_VERSION = 1
+  DYNAMICS_VERSION = 2
   SOLVER = 'goal_solver'
   REACH = 0.45
 
@@ -66,8 +72,8 @@ class AppleMaze(apple_rooms.AppleRoom):
     super().__init__(arena, **options)
     style = appearance.geom_style(arenas.WALL, (*_LOOK.walls, 1.0))
     wall = {'type': 'box', 'size': (*_SIZE / 2, 0.5), **style}
-    parts = [moving.MovingPart(f'wall_{i}', [wall]) for i in range(_MOST)]
-    self._walls = tuple(part.attach_to(arena, (0, 2, -5)) for part in parts)
+    parts = [moving.MovingPart(f'wall_{i}', [wall]) for i in range(_NUM_WALLS)]
+    self._walls = tuple(part.attach_to(arena, _BELOW) for part in parts)
     self.add_apples(_NUM_APPLES)
 
   @property
@@ -78,19 +84,9 @@ class AppleMaze(apple_rooms.AppleRoom):
       self, physics: protocols.Physics, random_state: Any
   ) -> None:
     self.place_avatar(physics, random_state)
-    for _ in range(100):
-      maze = labmaze.RandomMaze(
-          height=_ROWS + 2, width=_COLUMNS + 2, max_rooms=0,
-          extra_connection_probability=0.2,
-          random_seed=int(random_state.randint(2**31)),
-      )  # fmt: skip
-      is_wall = (maze.entity_layer[1:-1, 1:-1] == '*').ravel()
-      if _FEWEST <= is_wall.sum() <= _MOST:
-        break
-    else:
-      raise composer.EpisodeInitializationError('no maze of a fitting size')
+    is_wall = mazes.carve(_ROWS, _COLUMNS, _OPENINGS, random_state).ravel()
     cells = _CELLS[: len(is_wall)]
-    walls = np.full((_MOST, 3), -5.0)
+    walls = np.tile(_BELOW, (_NUM_WALLS, 1))
     walls[: is_wall.sum()] = np.insert(cells[is_wall], 2, 0.5, axis=1)
     moving.move(physics, self._walls, walls)
     free = random_state.permutation(cells[~is_wall])
@@ -98,12 +94,8 @@ class AppleMaze(apple_rooms.AppleRoom):
 
   def _way(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the next cell on the way to the nearest apple, `(..., 2)`."""
-    is_wall, has_apple = (
-        (_are_in(things[..., :2]) & (things[..., 2:] > 0)).any(axis=-2)
-        for things in (
-            physics.bind(self._walls).mocap_pos, self._apples.places(physics)
-        )
-    )  # fmt: skip
+    is_wall = _contain(physics.bind(self._walls).mocap_pos)
+    has_apple = _contain(self._apples.places(physics))
     # Numbers of steps from each cell to an apple.
     costs = np.where(has_apple, 0.0, np.inf)
     for _ in range(_ROWS * _COLUMNS // 2):
@@ -111,6 +103,16 @@ class AppleMaze(apple_rooms.AppleRoom):
       costs = np.where(is_wall, np.inf, np.minimum(costs, steps))
     here = _are_in(self._avatar.position(physics)).argmax(axis=-1)
     return _CELLS[np.where(_IS_NEXT[here], costs, np.inf).argmin(axis=-1)]
+
+
+def _contain(things: np.ndarray) -> np.ndarray:
+  """Returns whether cells contain one of things, `(..., cells)`.
+
+  Args:
+    things: Positions, `(..., things, 3)`, in m; those below the floor are in no
+      cell.
+  """
+  return (_are_in(things[..., :2]) & (things[..., 2:] > 0)).any(axis=-2)
 
 
 def _are_in(places: np.ndarray) -> np.ndarray:

@@ -1,0 +1,11 @@
+"""Default arguments of mazes."""
+
+MAX_ROOMS = 4
+ROOM_MIN_SIZE = 3
+ROOM_MAX_SIZE = 5
+MAX_VARIATIONS = 26
+SIMPLIFY = True
+SPAWN_COUNT = 0
+SPAWN_TOKEN = 'P'
+OBJECT_COUNT = 0
+OBJECT_TOKEN = 'G'
