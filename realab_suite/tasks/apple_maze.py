@@ -112,7 +112,9 @@ def _contain(things: np.ndarray) -> np.ndarray:
     things: Positions, `(..., things, 3)`, in m; those below the floor are in no
       cell.
   """
-  return (_are_in(things[..., :2]) & (things[..., 2:] > 0)).any(axis=-2)
+  are_in = _are_in(things[..., :2]) & (things[..., 2:] > 0)
+  contain: np.ndarray = are_in.any(axis=-2)
+  return contain
 
 
 def _are_in(places: np.ndarray) -> np.ndarray:
