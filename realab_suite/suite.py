@@ -8,6 +8,7 @@ import importlib
 from importlib import resources
 import pkgutil
 from typing import Any, final
+import warnings
 
 from dm_control import composer
 from dm_control.rl import control
@@ -32,6 +33,15 @@ from realab_suite.engine import seeding
 from realab_suite.feedback import mechanisms
 from realab_suite.feedback import specs
 from realab_suite.tasks import registry
+
+# Importing Composer makes Python show all such warnings. This one is about a
+# line of dm_control that NumPy 2.5 deprecates, and every load repeats it.
+warnings.filterwarnings(
+    'ignore',
+    'Setting the shape on a NumPy array',
+    DeprecationWarning,
+    r'dm_control\.mujoco\.index',
+)
 
 MAX_STEPS = 250
 """Length of an episode of the tasks of this suite, in control steps."""

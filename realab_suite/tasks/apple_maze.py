@@ -113,7 +113,7 @@ def _contain(things: np.ndarray) -> np.ndarray:
       cell.
   """
   are_in = _are_in(things[..., :2]) & (things[..., 2:] > 0)
-  contain: np.ndarray = are_in.any(axis=-2)
+  contain: np.ndarray = np.any(are_in, axis=-2)
   return contain
 
 
