@@ -40,10 +40,8 @@ _CELLS = np.array(
 )
 # Whether one may go from a cell to another, if no wall is there.
 _IS_NEXT = (np.abs(_CELLS[:, None] - _CELLS) / _SIZE).sum(axis=-1) < 1.5
-# Probability that a further way is opened where a maze has a wall.
-_OPENINGS = 0.2
-# Between 6 walls, those that every maze has, and 12. All are moved, so that the
-# world is compiled once; those that a maze lacks are below the floor.
+# All are moved, so that the world is compiled once; those that a maze lacks are
+# below the floor.
 _NUM_WALLS = mazes.most_walls(_ROWS, _COLUMNS)
 _BELOW = (0.0, 2.0, -5.0)
 _LOOK = arenas.Look((0.3, 0.48, 0.3), ((0.52, 0.47, 0.4), (0.58, 0.53, 0.45)))
@@ -84,7 +82,7 @@ class AppleMaze(apple_rooms.AppleRoom):
       self, physics: protocols.Physics, random_state: Any
   ) -> None:
     self.place_avatar(physics, random_state)
-    is_wall = mazes.carve(_ROWS, _COLUMNS, _OPENINGS, random_state).ravel()
+    is_wall = mazes.carve(_ROWS, _COLUMNS, 0.2, random_state).ravel()
     cells = _CELLS[: len(is_wall)]
     walls = np.tile(_BELOW, (_NUM_WALLS, 1))
     walls[: is_wall.sum()] = np.insert(cells[is_wall], 2, 0.5, axis=1)
@@ -109,11 +107,10 @@ def _contain(things: np.ndarray) -> np.ndarray:
   """Returns whether cells contain one of things, `(..., cells)`.
 
   Args:
-    things: Positions, `(..., things, 3)`, in m; those below the floor are in no
-      cell.
+    things: Positions, `(..., things, 3)`, in m; below the floor is no cell.
   """
-  are_in = _are_in(things[..., :2]) & (things[..., 2:] > 0)
-  contain: np.ndarray = np.any(are_in, axis=-2)
+  are_in = _are_in(things[..., :2])
+  contain: np.ndarray = np.any(are_in & (things[..., 2:] > 0), axis=-2)
   return contain
 
 

@@ -7,6 +7,7 @@ import math
 import pathlib
 import platform
 import resource
+import sys
 from typing import Any
 from unittest import mock
 
@@ -244,6 +245,12 @@ def test_a_row_names_the_versions_that_it_depends_on():
       'dm-control': results.metadata.version('dm-control'),
       'mujoco': mujoco.__version__,
       'numpy': np.__version__,
+      # The stand-in alone, in a process that has imported it.
+      **(
+          {'labmaze': results.metadata.version('labmaze')}
+          if hasattr(sys.modules.get('labmaze'), 'STAND_IN')
+          else {}
+      ),
   }
   info = _row().info
   assert info.versions == results.versions()

@@ -41,7 +41,8 @@ def _status(url):
     with request.urlopen(url, timeout=patience.SECONDS) as answer:
       return answer.status
   except error.HTTPError as refusal:
-    return refusal.code
+    with refusal:  # Its body is a file.
+      return refusal.code
 
 
 def test_the_page_needs_the_token(server):
