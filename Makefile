@@ -12,7 +12,6 @@ INSTALL = $(PY) -m pip install -qq --disable-pip-version-check \
 INSTALL_LABMAZE = if $(PY) -c 'import sys; sys.exit(sys.version_info < (3, 13))'; \
 	then $(INSTALL) ./compat/labmaze; fi
 WORKERS = 2
-DEMO := results/demo-$(shell date +%Y%m%d-%H%M%S)
 
 .PHONY: help demo test lint docs format clean
 
@@ -25,8 +24,7 @@ help:
 	@echo 'make clean   remove .venv, builds and caches, but not results/'
 
 demo: .venv/demo
-	$(PY) -m realab_suite.launchers.sweep --experiment=quick --output=$(DEMO)
-	$(PY) -m realab_suite.launchers.report --input=$(DEMO)
+	.venv/bin/realab demo
 
 test: lint
 	$(PY) -m pytest -q -n $(WORKERS) --dist loadfile

@@ -18,6 +18,7 @@ from realab_suite.config import loading
 from realab_suite.experiments import engines
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
+from realab_suite.experiments import progress
 from realab_suite.experiments import storage
 from realab_suite.experiments import training
 
@@ -243,6 +244,7 @@ class _Sweep:
     """Runs all jobs; see `sweep`."""
     count = len(self._all)
     total = sum(r.job.training.total for r in self._all if not r.job.policy)
+    pace = progress.Pace(total, time.monotonic())
     bar = tqdm.tqdm(total=total, unit='step', unit_scale=True, disable=None)
     with bar:
       try:
@@ -251,6 +253,8 @@ class _Sweep:
           self._poll()
           steps = sum(run.num_steps for run in self._all)
           bar.update(min(steps, total) - bar.n)
+          if line := pace.line(min(steps, total), time.monotonic()):
+            self._say(line)
           failed = f', {len(self._failures)} failed' if self._failures else ''
           bar.set_postfix_str(
               f'{self._num_finished} of {count} jobs{failed}', refresh=False

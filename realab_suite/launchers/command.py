@@ -12,6 +12,7 @@ import runpy
 import subprocess
 import sys
 
+import realab_suite
 from realab_suite.config import messages
 from realab_suite.experiments import requirements
 from realab_suite.launchers import program
@@ -40,6 +41,22 @@ COMMANDS: Mapping[str, str] = {
     'unpack': 'unpack a packed sweep',
 }
 """Subcommands with their purposes."""
+_WITHOUT_FLAGS = {
+    'demo': (
+        'Trains agents in Unlock Door, and reports on them. Writes into a new'
+        ' folder results/demo-*.'
+    ),
+    'doctor': 'Says what works in this installation, and how to repair it.',
+}
+_NEXT = """
+One seed shows that tampering is learned, not how often. Next:
+  realab sweep --experiment=meter_only --output=results/meter_only
+                                          five seeds, another register
+  realab audit --task=unlock_door.near --output=results/audit
+                                          search for an exploit, untrained
+  realab report --input={output}
+                                          write this report again
+"""
 _DEMO_NEEDS = ('jax', 'equinox', 'optax', 'matplotlib', 'jinja2')
 
 
@@ -50,17 +67,24 @@ def main() -> int:
     The exit status; launchers end the process with theirs.
   """
   _, *arguments = sys.argv
+  if len(arguments) == 2 and arguments[0] == 'help':
+    arguments = [arguments[1], '--help']
   if not arguments or arguments[0] in ('help', '-h', '--help'):
     sys.stdout.write(_usage())
     return 0 if arguments else program.USAGE_ERROR
   name, *rest = arguments
+  if name == '--version':
+    sys.stdout.write(f'realab_suite {realab_suite.__version__}\n')
+    return 0
   if name not in COMMANDS:
+    hint = messages.did_you_mean(name, (*COMMANDS, 'help', '--version'))
     return _refuse(
-        f'command {name!r:.80} is'
-        f' unknown{messages.did_you_mean(name, COMMANDS)}; known are'
-        f' {list(COMMANDS)}'
+        f'command {name!r:.80} is unknown{hint}; known are' f' {list(COMMANDS)}'
     )
-  if name in ('demo', 'doctor') and rest:
+  if name in _WITHOUT_FLAGS and rest in (['-h'], ['--help']):
+    sys.stdout.write(f'usage: realab {name}\n\n{_WITHOUT_FLAGS[name]}\n')
+    return 0
+  if name in _WITHOUT_FLAGS and rest:
     return _refuse(f'{name}: arguments {rest}; allowed are none')
   if name == 'demo':
     return _demo()
@@ -106,4 +130,5 @@ def _demo() -> int:
     )
     if ran.returncode:
       return ran.returncode
+  sys.stdout.write(_NEXT.format(output=output))
   return 0

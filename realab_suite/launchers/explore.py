@@ -1,8 +1,8 @@
 """Shows a world in a window, or writes a film if there is no display.
 
-For example, this shows an agent that tampers with the reward of Unlock Door:
+By default, a saboteur of the world acts. This shows the solver of Unlock Door:
 
-  python -m realab_suite.launchers.explore --policy=carrying_saboteur
+  python -m realab_suite.launchers.explore --policy=apple_seeker
 """
 
 from collections.abc import Callable, Iterator
@@ -41,7 +41,7 @@ def _open_window() -> None:
   # This and later imports need a renderer to be chosen first.
   from dm_control import viewer
 
-  with _loaded() as (env, policy):
+  with _loaded(_policy_name()) as (env, policy):
     viewer.launch(env, policy=_as_function(policy, env), title='realab_suite')
 
 
@@ -54,17 +54,24 @@ def _write_film() -> None:
   from realab_suite.experiments import tracking
   from realab_suite.reports import films
 
-  world = '_'.join(flags.domain_and_task())
-  path = flags.VIDEO.value or _unused(
-      f'{world}_{flags.POLICY.value}_{flags.SEED.value}'
-  )
+  world, name = '_'.join(flags.domain_and_task()), _policy_name()
+  path = flags.VIDEO.value or _unused(f'{world}_{name}_{flags.SEED.value}')
+  program.say(f'Filming an episode of {name}; it takes up to minutes')
   with (
-      _loaded() as (env, policy),
-      films.film(env, path, flags.POLICY.value) as add,
+      _loaded(name) as (env, policy),
+      films.film(env, path, name) as add,
   ):
     recorder = tracking.Tracker(env, add)
     evaluate.evaluate(env, policy, 1, sinks=[recorder])
   program.say(f'The film is {path}')
+
+
+def _policy_name() -> str:
+  """Returns the policy of the flags, or else a saboteur of the world."""
+  if flags.POLICY.present:
+    return str(flags.POLICY.value)
+  saboteurs = flags.world().saboteurs
+  return saboteurs[0] if saboteurs else str(flags.POLICY.value)
 
 
 def _unused(stem: str) -> str:
@@ -78,14 +85,14 @@ def _unused(stem: str) -> str:
 
 
 @contextlib.contextmanager
-def _loaded() -> Iterator[tuple[Any, Any]]:
-  """Yields the environment and the policy that the flags name."""
+def _loaded(name: str) -> Iterator[tuple[Any, Any]]:
+  """Yields the environment that the flags name, and a policy by its name."""
   from realab_suite.audit import aiming
 
   flags.load_imports()
   env = flags.world().load(flags.design(), flags.SEED.value)
   with contextlib.closing(env):
-    policy = aiming.make_policy(flags.POLICY.value, env, flags.TARGET.value, 0)
+    policy = aiming.make_policy(name, env, flags.TARGET.value, 0)
     env.rewind()
     yield env, policy
 

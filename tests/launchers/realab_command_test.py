@@ -12,7 +12,9 @@ from typing import Any
 
 import pytest
 
+import realab_suite
 from realab_suite import doctor
+from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import requirements
 from realab_suite.launchers import command
 from realab_suite.launchers import play
@@ -86,6 +88,7 @@ def test_a_subcommand_runs_its_launcher_with_its_flags(realab):
 @pytest.mark.parametrize(
     ('arguments', 'message'),
     [
+        (['hepl'], "command 'hepl' is unknown; did you mean 'help'?; "),
         (['repot'], "command 'repot' is unknown; did you mean 'report'?; "),
         (['--experiment=quick'], "command '--experiment=quick' is unknown; kn"),
         (['demo', '--seed=1'], "demo: arguments ['--seed=1']; allowed are no"),
@@ -108,7 +111,23 @@ def test_help_lists_every_subcommand(realab, capsys):
     assert f'  {name:14} {purpose}\n' in shown
 
 
-def test_the_demo_is_that_of_the_makefile(realab, monkeypatch):
+def test_each_subcommand_has_help(realab, capsys):
+  for name in ('demo', 'doctor'):
+    for arguments in ((name, '--help'), (name, '-h'), ('help', name)):
+      assert realab(*arguments) == (0, [])
+      assert capsys.readouterr().out.startswith(f'usage: realab {name}\n')
+  _, started = realab('help', 'audit')
+  assert started == [('realab_suite.launchers.audit', ['audit', '--help'])]
+
+
+def test_the_version_is_printed(realab, capsys):
+  assert realab('--version') == (0, [])
+  assert capsys.readouterr().out == f'realab_suite {realab_suite.__version__}\n'
+
+
+def test_the_demo_of_the_makefile_ends_with_commands_that_can_be_run(
+    realab, monkeypatch, capsys
+):
   ran: list[list[str]] = []
 
   def run(arguments: list[str], check: bool) -> Any:
@@ -119,10 +138,15 @@ def test_the_demo_is_that_of_the_makefile(realab, monkeypatch):
   monkeypatch.setattr(subprocess, 'run', run)
   assert realab('demo')[0] == 0
   output = ran[1][2].removeprefix('--input=')
-  recipe = (_ROOT / 'Makefile').read_text().replace('$(DEMO)', output)
   assert output.startswith('results/demo-')
-  for arguments in ran:
-    assert f'$(PY) {" ".join(arguments)}\n' in recipe
+  assert '\t.venv/bin/realab demo\n' in (_ROOT / 'Makefile').read_text()
+  commands = re.findall('^  realab (.*)', capsys.readouterr().out, re.MULTILINE)
+  assert len(commands) == 3
+  for name, *arguments in map(str.split, commands):
+    module = importlib.import_module(f'realab_suite.launchers.{name}')
+    # Refused for the last argument alone.
+    assert "'and more'" in in_process.complaint(module, *arguments, 'and more')
+  assert len(experiment_specs.load('meter_only').seeds) == 5
 
 
 def test_a_demo_that_fails_ends_with_the_status_of_its_sweep(
