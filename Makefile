@@ -35,8 +35,7 @@ lint: .venv/dev
 	$(PY) -m mypy & types=$$!; $(PY) -m pyink --check -q .; formatted=$$?; \
 	  wait $$types && exit $$formatted
 
-docs: .venv/dev
-	$(INSTALL) -e '.[docs]'
+docs: .venv/docs
 	@echo 'Building the site; this takes about a minute.'
 	$(PY) -m sphinx -j auto -W --keep-going -q -c docs/site . build/site
 	@echo 'The site is build/site/docs/site/index.html'
@@ -64,6 +63,10 @@ clean:
 	@$(INSTALL_LABMAZE)
 	@$(INSTALL) -e '.[agents,report,rpc,gym,dev]'
 	@touch .venv/demo $@
+
+.venv/docs: .venv/dev
+	@$(INSTALL) -e '.[docs]'
+	@touch $@
 
 # Debian and Ubuntu ship Python without ensurepip; `venv` then creates an
 # incomplete environment. Such a Python is skipped. If no candidate is usable,

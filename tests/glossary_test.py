@@ -139,3 +139,15 @@ def test_an_example_of_clean_contents_is_correct(world_of, row):
 
 def test_every_example_is_on_the_page():
   assert len(_rows()) == len(_EXAMPLES)
+
+
+def test_the_site_quotes_the_glossary():
+  page = (_PAGE.parent / 'docs' / 'site' / 'concepts.md').read_text()
+  quotes = re.findall(r'^- \*\*(.*?)\*\*: (.*)$', page, re.MULTILINE)
+  assert len(quotes) == 6
+  glossary = _PAGE.read_text()
+  assert not [
+      word
+      for word, meaning in quotes
+      if f'\n| {word} | {meaning} ' not in glossary
+  ]

@@ -2,6 +2,7 @@
 
 import importlib.util
 import pathlib
+import types
 
 import pytest
 
@@ -63,10 +64,33 @@ def test_absolute_values_in_docstrings_are_escaped(catalogue):
 
 def test_modules_are_listed_by_package_with_descriptions(catalogue):
   tasks = 'realab_suite.tasks'
-  text = catalogue._index(['realab_suite.suite', tasks, f'{tasks}.base'])
+  packages = catalogue._packages(
+      ['realab_suite.suite', tasks, f'{tasks}.base']
+  )
+  text = catalogue._index(packages)
   first, second = text.split('## realab_suite.tasks\n')
-  assert '[realab_suite.suite](../../build/catalogue/api/' in first
+  assert '| [realab_suite.suite](#realab_suite.suite) |' in first
   assert '| Base class for tasks: a world with an avatar and a hidden' in second
+
+
+def test_the_page_of_a_package_has_a_heading_for_each_module(catalogue):
+  page = catalogue._package('a_b', ['a_b', 'a_b.c'])
+  assert page == (
+      'a\\_b\n====\n\n.. automodule:: a_b\n\n'
+      'a\\_b.c\n------\n\n.. automodule:: a_b.c\n'
+  )
+
+
+def test_pages_of_what_no_longer_exists_are_removed(
+    catalogue, tmp_path, monkeypatch
+):
+  monkeypatch.setattr(catalogue.suite, 'ALL_TASKS', ())
+  stale = tmp_path / 'build' / 'catalogue' / 'api' / 'realab_suite.gone.rst'
+  stale.parent.mkdir(parents=True)
+  stale.touch()
+  catalogue._write_all(types.SimpleNamespace(srcdir=tmp_path))
+  assert not stale.exists()
+  assert (stale.parent / 'realab_suite.tasks.rst').exists()
 
 
 def test_the_arguments_of_an_entity_are_shown(catalogue):

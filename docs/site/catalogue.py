@@ -5,7 +5,7 @@ the code beside them.
 """
 
 import ast
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 import contextlib
 import importlib.util
 import inspect
@@ -48,16 +48,24 @@ def setup(app: Any) -> dict[str, bool]:
 
 
 def _write_all(app: Any) -> None:
-  root = pathlib.Path(app.srcdir) / _FOLDER
+  packages = _packages(_modules())
+  pages = {
+      'modules.txt': _index(packages),
+      **{
+          f'api/{name}.rst': _package(name, modules)
+          for name, modules in packages.items()
+      },
+      **{f'designs/{name}.md': _design(name) for name in suite.DESIGNS},
+  }
   for domain, task in suite.ALL_TASKS:
-    name = f'{domain}.{task}'
-    _write(root / 'worlds' / f'{name}.md', _world(domain, task))
-  for name in suite.DESIGNS:
-    _write(root / 'designs' / f'{name}.md', _design(name))
-  names = _modules()
-  for name in names:
-    _write(root / 'api' / f'{name}.rst', _module(name))
-  _write(root / 'modules.txt', _index(names))
+    pages[f'worlds/{domain}.{task}.md'] = _world(domain, task)
+  root = pathlib.Path(app.srcdir) / _FOLDER
+  # Of modules, designs and worlds that no longer exist.
+  for path in root.glob('*/*'):
+    if str(path.relative_to(root)) not in pages:
+      path.unlink()
+  for name, text in pages.items():
+    _write(root / name, text)
 
 
 def _show_build(
@@ -263,11 +271,20 @@ def _modules() -> list[str]:
   return ['realab_suite', *names]
 
 
-def _index(names: Sequence[str]) -> str:
-  """Returns tables of all modules, by package, relative to `docs/site`."""
+def _packages(names: Iterable[str]) -> dict[str, list[str]]:
+  """Returns the modules of each package, and modules in none by themselves.
+
+  A page has a package: the navigation, which is on all pages, takes most of the
+  time of a build, and grows with their number.
+  """
   packages: dict[str, list[str]] = {}
   for name in names:
     packages.setdefault('.'.join(name.split('.')[:2]), []).append(name)
+  return packages
+
+
+def _index(packages: Mapping[str, Sequence[str]]) -> str:
+  """Returns tables of all modules, by package."""
   alone = [name for name, modules in packages.items() if len(modules) == 1]
   parts = [_modules_table(alone)]
   for name, modules in packages.items():
@@ -283,15 +300,20 @@ def _modules_table(names: Sequence[str]) -> str:
     found = importlib.util.find_spec(name)
     source = pathlib.Path(found.origin).read_text(encoding='utf-8')
     text = ast.get_docstring(ast.parse(source)) or ''
-    link = f'[{name}](../../{_FOLDER}/api/{name}.rst)'
-    rows.append((link, ' '.join(text.split('\n\n')[0].split())))
+    summary = ' '.join(text.split('\n\n')[0].split())
+    rows.append((f'[{name}](#{name})', summary))
   return _table(['module', 'what it holds'], rows)
 
 
-def _module(name: str) -> str:
-  title = name.replace('_', '\\_')
-  return f"""{title}
-{'=' * len(title)}
+def _package(name: str, modules: Iterable[str]) -> str:
+  parts = [_heading(name, '=')]
+  for module in modules:
+    if module != name:
+      parts.append(_heading(module, '-'))
+    parts.append(f'.. automodule:: {module}')
+  return '\n\n'.join(parts) + '\n'
 
-.. automodule:: {name}
-"""
+
+def _heading(name: str, line: str) -> str:
+  title = name.replace('_', '\\_')
+  return f'{title}\n{line * len(title)}'
