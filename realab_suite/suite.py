@@ -20,6 +20,7 @@ from realab_suite import tasks
 from realab_suite.config import integers
 from realab_suite.config import loading
 from realab_suite.config import messages
+from realab_suite.config import task_names
 from realab_suite.engine import arguments
 from realab_suite.engine import batch_environment
 from realab_suite.engine import control_sources
@@ -61,6 +62,14 @@ def _control_name(domain_name: Any) -> str | None:
   if isinstance(domain_name, str) and domain_name.startswith(CONTROL_SUITE):
     return domain_name.removeprefix(CONTROL_SUITE)
   return None
+
+
+def _names(domain_name: Any, task_name: Any) -> tuple[Any, Any]:
+  """Returns the names of a domain and a task; the first may contain both."""
+  is_dotted = isinstance(domain_name, str) and '.' in domain_name
+  if task_name is None and is_dotted:
+    return task_names.split(domain_name)
+  return domain_name, task_name
 
 
 def get_tasks_by_tag(tag: str) -> tuple[tuple[str, str], ...]:
@@ -171,7 +180,7 @@ def dynamics(domain_name: str, task_name: str) -> tuple[int, str | None]:
 
 def load(
     domain_name: str,
-    task_name: str,
+    task_name: str | None = None,
     task_kwargs: Mapping[str, Any] | None = None,
     environment_kwargs: Mapping[str, Any] | None = None,
     visualize_reward: bool = False,
@@ -182,7 +191,8 @@ def load(
   """Loads a task with the feedback of an agent design.
 
   Args:
-    domain_name: Name of the domain, such as `'unlock_door'`.
+    domain_name: Name of the domain, such as `'unlock_door'`; or of the task
+      with its domain, `'unlock_door.standard'`, without `task_name`.
     task_name: Name of the variation, such as `'standard'`.
     task_kwargs: Seed `random` and keyword arguments of the task, such as
       `camera_size`.
@@ -204,6 +214,7 @@ def load(
         f'visualize_reward={messages.quote(visualize_reward)} would show the'
         ' true reward to the agent; allowed is False'
     )
+  domain_name, task_name = _names(domain_name, task_name)
   factory: Callable[..., Any]
   options: dict[str, Any] = {}
   if control_name := _control_name(domain_name):
@@ -239,7 +250,7 @@ def load(
 
 def load_batch(
     domain_name: str,
-    task_name: str,
+    task_name: str | None = None,
     task_kwargs: Mapping[str, Any] | None = None,
     environment_kwargs: Mapping[str, Any] | None = None,
     *,

@@ -4,6 +4,7 @@
 """
 
 from collections.abc import Callable
+import contextlib
 import functools
 import inspect
 from typing import Any
@@ -229,6 +230,45 @@ def test_an_unknown_task_is_refused_with_the_known_ones(domain: str, task: str):
   assert 'known once its module is imported (--import' in text
   for known, tasks in suite.TASKS_BY_DOMAIN.items():
     assert f' {known}.{{{",".join(tasks)}}}' in text
+
+
+@pytest.mark.parametrize('load', [suite.load, _load_batch])
+def test_a_domain_may_name_its_task(load: Any):
+  with contextlib.closing(load('unlock_door.far', None, {'random': 1})) as env:
+    dotted = env.reset()
+  with contextlib.closing(load('unlock_door', 'far', {'random': 1})) as env:
+    expected = env.reset()
+  for key, value in expected.observation.items():
+    np.testing.assert_array_equal(dotted.observation[key], value)
+
+
+def test_a_domain_of_dm_control_may_name_its_task():
+  env = suite.load('dm_control/cartpole.balance', design='none')
+  assert env.reset().first()
+  env.close()
+
+
+@pytest.mark.parametrize(
+    ('name', 'complaint'),
+    [
+        (
+            'unlock_door',
+            'task unlock_door: a domain alone; allowed are'
+            ' unlock_door.{standard,near,far,boxed,impossible}',
+        ),
+        ('unlock_dor', "unlock_dor is unknown; did you mean 'unlock_door'?"),
+        ('unlock_door.nere', "did you mean 'unlock_door.near'?"),
+        ('dm_control/point_mass', "known are ['point_mass.easy', 'point_m"),
+        ('dm_control/cartpole.swing', "did you mean 'cartpole.swingup'?"),
+        (3, 'task 3 is unknown; known are apple_maze.{'),
+    ],
+)
+def test_a_name_that_is_no_task_is_refused_with_tasks(
+    name: Any, complaint: str
+):
+  with pytest.raises(errors.UnknownNameError) as caught:
+    suite.load(name)
+  assert complaint in str(caught.value)
 
 
 @pytest.mark.parametrize(

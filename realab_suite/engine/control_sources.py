@@ -63,9 +63,11 @@ def load(
 
   if (domain_name, task_name) not in suite.ALL_TASKS:
     known = [f'{domain}.{task}' for domain, task in suite.ALL_TASKS]
+    related = [name for name in known if name.startswith(f'{domain_name}.')]
+    hint = messages.did_you_mean(f'{domain_name}.{task_name}', known)
     raise errors.UnknownNameError(
         f'task {messages.quote(task_name)} of {messages.quote(domain_name)} is'
-        f' unknown in dm_control.suite; known are {known}'
+        f' unknown in dm_control.suite{hint}; known are {related or known}'
     )
   return suite.load(domain_name, task_name, task_kwargs={'random': 0, **kwargs})
 

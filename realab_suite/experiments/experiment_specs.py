@@ -14,6 +14,7 @@ from realab_suite import worlds
 from realab_suite.config import documents
 from realab_suite.config import loading
 from realab_suite.config import option_types
+from realab_suite.config import task_names
 from realab_suite.config import validation
 from realab_suite.engine import arguments
 from realab_suite.evaluation import actors
@@ -35,7 +36,7 @@ _TaskKwargs = Annotated[dict[str, Any], pydantic.AfterValidator(_refuse_seed)]
 
 
 def _known_task(task: str) -> str:
-  suite.dynamics(*_split(task))
+  suite.dynamics(*task_names.split(task))
   return task
 
 
@@ -296,7 +297,7 @@ class ExperimentSpec(validation.Spec):
         )
       self._designs[name] = run, design
     for task in self.training.tasks:
-      if registry.HELD_OUT in registry.tags(*_split(task)):
+      if registry.HELD_OUT in registry.tags(*task_names.split(task)):
         raise ValueError(
             f'training.tasks: {task} is held out; allowed are tasks that'
             f' lack the tag {registry.HELD_OUT!r}, which is for judging'
@@ -321,7 +322,7 @@ class ExperimentSpec(validation.Spec):
       judged = env.observation_spec(), env.action_spec()
     domain, _ = self.domain_and_variation
     for task in self.training.tasks:
-      if task == self.task or _split(task)[0] != domain:
+      if task == self.task or task_names.split(task)[0] != domain:
         raise errors.SpecError(
             f'training.tasks: {task}; allowed are tasks of {domain} other than'
             f' {self.task}, which is judged'
@@ -352,7 +353,7 @@ class ExperimentSpec(validation.Spec):
   @property
   def domain_and_variation(self) -> tuple[str, str]:
     """Names of the domain and of the task, as for `suite.load`."""
-    return _split(self.task)
+    return task_names.split(self.task)
 
   @property
   def world(self) -> worlds.World:
@@ -417,12 +418,6 @@ class ExperimentSpec(validation.Spec):
             ' run has one of its own'
         )
     return load({**self.to_mapping(), 'task': task})
-
-
-def _split(task: str) -> tuple[str, str]:
-  """Returns the names of the domain and of the task."""
-  domain, _, variation = task.partition('.')
-  return domain, variation
 
 
 Experiment = documents.Source | ExperimentSpec

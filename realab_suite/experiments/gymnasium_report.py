@@ -22,6 +22,7 @@ from realab_suite import suite
 from realab_suite import worlds
 from realab_suite.audit import aiming
 from realab_suite.config import integers
+from realab_suite.config import task_names
 from realab_suite.engine import environment
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import stakes
@@ -167,8 +168,8 @@ def _maker(
   Raises:
     SpecError: If it is the id of another package.
   """
-  domain, dot, task = name.partition('.')
-  if dot and (domain, task) in registry.names():
+  domain, task = task_names.split(name)
+  if (domain, task) in registry.names():
     named = {'domain_name': domain, 'task_name': task}
     return registration.make, {**named, **options}
   module, _, registered = name.rpartition(':')

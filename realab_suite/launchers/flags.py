@@ -15,6 +15,7 @@ from absl import flags
 from realab_suite import errors
 from realab_suite.config import loading
 from realab_suite.config import messages
+from realab_suite.config import task_names
 
 if TYPE_CHECKING:  # They import dm_control, so a renderer has to be chosen.
   from realab_suite import worlds
@@ -292,8 +293,8 @@ def domain_and_task() -> tuple[str, str]:
   Raises:
     SpecError: If the flags name two domains.
   """
-  domain, dot, task = TASK.value.rpartition('.')
-  if not dot:
+  domain, task = task_names.split(TASK.value)
+  if not domain:
     return DOMAIN.value, task
   if DOMAIN.present and DOMAIN.value != domain:
     raise errors.SpecError(

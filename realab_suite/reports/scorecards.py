@@ -19,6 +19,7 @@ from realab_suite import policies
 from realab_suite import suite
 from realab_suite import worlds
 from realab_suite.config import loading
+from realab_suite.config import task_names
 from realab_suite.config import validation
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import hacking
@@ -370,7 +371,7 @@ def _of_sweep(sweep: sweep_results.Sweep) -> list[_Actor]:
   for run in sweep.learned():
     settings, source = sweep.experiment['runs'][run.name], str(sweep.folder)
     task = settings.get('task') or sweep.experiment['task']
-    domain, _, name = task.partition('.')
+    domain, name = task_names.split(task)
     column = run.jobs[0].design
     if run.name not in figures:
       column = OWN_DESIGN if column == domain else column

@@ -15,6 +15,7 @@ import pydantic
 
 from realab_suite import errors
 from realab_suite import worlds
+from realab_suite.config import task_names
 from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
 from realab_suite.experiments import jobs
@@ -122,7 +123,7 @@ class Run:
   @functools.cached_property
   def world(self) -> worlds.World:
     """World in which the run was evaluated."""
-    domain, _, task = self.config['task'].partition('.')
+    domain, task = task_names.split(self.config['task'])
     senses = self.config['environment_kwargs']['senses']
     return worlds.World(
         domain,

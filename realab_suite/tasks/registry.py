@@ -109,26 +109,37 @@ def register_layouts(
   return decorate
 
 
-def find(domain_name: str, task_name: str) -> TaskFactory:
+def find(domain_name: str, task_name: str | None) -> TaskFactory:
   """Returns the function that makes a task.
+
+  Args:
+    domain_name: Name of the domain.
+    task_name: Name of the task; `None` is unknown, as any other.
 
   Raises:
     UnknownNameError: If there is no such task.
   """
-  are_strings = isinstance(domain_name, str) and isinstance(task_name, str)
-  if not are_strings or (domain_name, task_name) not in _TASKS:
+  if isinstance(domain_name, str) and isinstance(task_name, str):
+    if (domain_name, task_name) in _TASKS:
+      return _TASKS[domain_name, task_name][0]
+  domains: dict[str, list[str]] = {}
+  for domain, task in _TASKS:
+    domains.setdefault(domain, []).append(task)
+  listed = {k: f'{k}.{{{",".join(v)}}}' for k, v in domains.items()}
+  given = _format(domain_name)
+  known = [*domains]
+  if task_name is not None:
+    given = f'{given}.{_format(task_name)}'
     known = [f'{domain}.{task}' for domain, task in _TASKS]
-    given = f'{_format(domain_name)}.{_format(task_name)}'
-    domains: dict[str, list[str]] = {}
-    for domain, task in _TASKS:
-      domains.setdefault(domain, []).append(task)
-    listed = ', '.join(f'{k}.{{{",".join(v)}}}' for k, v in domains.items())
+  elif given in listed:
     raise errors.UnknownNameError(
-        f'task {given} is unknown{messages.did_you_mean(given, known)}; known'
-        f' are {listed}; a task of your own is known once its module is'
-        ' imported (--import of programs)'
+        f'task {given}: a domain alone; allowed are {listed[given]}'
     )
-  return _TASKS[domain_name, task_name][0]
+  raise errors.UnknownNameError(
+      f'task {given} is unknown{messages.did_you_mean(given, known)}; known'
+      f' are {", ".join(listed.values())}; a task of your own is known once its'
+      ' module is imported (--import of programs)'
+  )
 
 
 def names(tag: str | None = None) -> tuple[tuple[str, str], ...]:

@@ -254,7 +254,7 @@ def test_options_of_batches_point_single_worlds_to_make_vec(option):
 
 @pytest.mark.parametrize(
     ('world', 'expected'),
-    [(('unlock_door', 'near'), 10), (('dm_control/cartpole', 'balance'), 100)],
+    [(('unlock_door.near',), 10), (('dm_control/cartpole', 'balance'), 100)],
 )
 def test_frames_show_a_world_in_real_time(world, expected):
   # The second world has no camera `top_down`.

@@ -25,15 +25,15 @@ _OF_BATCHES = ('num_envs', 'num_threads', 'sleep', 'autoreset_mode')
 
 def make(
     domain_name: str,
-    task_name: str,
+    task_name: str | None = None,
     design: specs.Design | None = None,
     **options: Any,
 ) -> Any:
   """Loads a world: the entry point of the registered ids.
 
   Args:
-    domain_name: Name of the domain.
-    task_name: Name of the variation.
+    domain_name: Same as in `suite.load`.
+    task_name: Same as in `suite.load`.
     design: Design, by name, path or contents.
     **options: Other arguments of `suite.load`, and values of
       `interfaces.Options`.
@@ -56,7 +56,7 @@ def make(
 
 def make_vector(
     domain_name: str,
-    task_name: str,
+    task_name: str | None = None,
     design: specs.Design | None = None,
     *,
     num_envs: int,
@@ -65,8 +65,8 @@ def make_vector(
   """Loads a batch of worlds: the vector entry point of the registered ids.
 
   Args:
-    domain_name: Name of the domain.
-    task_name: Name of the variation.
+    domain_name: Same as in `suite.load`.
+    task_name: Same as in `suite.load`.
     design: Design, by name, path or contents.
     num_envs: Number of worlds.
     **options: Other arguments of `suite.load_batch`, `autoreset_mode`, and
