@@ -81,3 +81,8 @@ class UnknownNameError(SpecError, KeyError):
 
   # KeyError prints the repr of its argument, which would quote the message.
   __str__ = Exception.__str__
+
+
+@final
+class UnknownOptionError(SpecError, TypeError):
+  """A keyword argument is unknown; the message lists the allowed ones."""

@@ -98,12 +98,17 @@ def digest_of(data: Mapping[str, Any]) -> str:
   return hashlib.sha256(canonical.encode()).hexdigest()[:16]
 
 
-def check_keys(given: Collection[str], allowed: Collection[str]) -> None:
+def check_keys(
+    given: Collection[str],
+    allowed: Collection[str],
+    problem: str = 'unknown key',
+) -> None:
   """Checks the keys of a mapping.
 
   Args:
     given: Keys of the mapping.
     allowed: Allowed keys.
+    problem: Name of the problem in the message.
 
   Raises:
     ValueError: If a key is not allowed.
@@ -112,7 +117,7 @@ def check_keys(given: Collection[str], allowed: Collection[str]) -> None:
   if unknown:
     hint = messages.did_you_mean(unknown[0], allowed)
     raise ValueError(
-        f'unknown key {messages.quote(unknown[0])}{hint} (allowed:'
+        f'{problem} {messages.quote(unknown[0])}{hint} (allowed:'
         f' {", ".join(allowed) or "none"})'
     )
 

@@ -191,10 +191,15 @@ def listed_codes(root: mjcf.RootElement) -> tuple[int, ...]:
   Args:
     root: Model of the world, with all entities attached.
   """
+  geoms = root.find_all('geom')
+  # Default classes may set the numbers of geoms that have none.
+  defaults = [
+      default.geom
+      for model in {geom.root for geom in geoms}
+      for default in model.find_all('default')
+  ]
   found = {
-      int(geom.user[0])
-      for geom in root.find_all('geom')
-      if geom.user is not None
+      int(geom.user[0]) for geom in (*geoms, *defaults) if geom.user is not None
   }
   return tuple(
       sorted(found.intersection(_codes_of_geoms()) | set(range(_NUM_LISTED)))

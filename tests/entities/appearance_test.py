@@ -4,6 +4,7 @@ import copy
 import pickle
 from typing import Any
 
+from dm_control import mjcf
 from dm_env import specs
 import numpy as np
 import pytest
@@ -79,6 +80,24 @@ def test_a_world_with_a_new_class_has_the_bounds_of_others_and_lists_it():
   spec[_RAYS].validate(observation[_RAYS])
 
 
+@pytest.mark.usefixtures('classes')
+def test_a_class_of_a_default_is_listed():
+  appearance.register('rock', code=30)
+  appearance.register('moss', code=31)
+  rocks = mjcf.RootElement(model='rocks')
+  rocks.default.geom.user = [30]
+  rocks.default.add('default', dclass='moss').geom.user = [31]
+  arena = arenas.OpenRoom()
+  arena.mjcf_model.attach(rocks)
+  usual = appearance.listed_codes(arena.mjcf_model)
+  assert usual == tuple(range(11))  # No geom yet.
+  for dclass in (None, 'moss'):
+    rocks.worldbody.add('geom', size=(0.1,), dclass=dclass)
+  physics = worlds.compile_world(arena)
+  assert {30, 31} < set(appearance.class_of_geoms(physics.model))
+  assert appearance.listed_codes(arena.mjcf_model) == (*usual, 30, 31)
+
+
 @pytest.mark.parametrize('domain', suite.TASKS_BY_DOMAIN)
 def test_the_specs_of_all_worlds_have_the_same_classes(domain: str):
   env = suite.load(domain, suite.TASKS_BY_DOMAIN[domain][0])
@@ -86,6 +105,8 @@ def test_the_specs_of_all_worlds_have_the_same_classes(domain: str):
   assert (spec.minimum, spec.maximum) == (0, appearance.CAPACITY - 1)
   # Those that each world lists, and then its own.
   assert spec.codes[:11] == tuple(range(11))
+  # Rays report nothing else.
+  assert set(appearance.class_of_geoms(env.physics.model)) <= set(spec.codes)
   env.close()
 
 

@@ -5,6 +5,7 @@ import inspect
 import pickle
 from typing import Any
 
+from dm_control import mjcf
 import numpy as np
 import pytest
 
@@ -23,10 +24,12 @@ from realab_suite.entities import appearance
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import evaluate
 from realab_suite.feedback import mechanisms
+from realab_suite.interop.gymnasium import codecs
 from realab_suite.interop.gymnasium import evaluation
 from realab_suite.interop.gymnasium import registration
 from realab_suite.interop.gymnasium import single
 from realab_suite.interop.gymnasium import vector
+from realab_suite.tasks import collect_apples
 from tests import examples
 
 _NEAR = 'realab/UnlockDoor-near-InstantaneousReward-v3'
@@ -82,8 +85,9 @@ def test_the_checker_of_gymnasium_has_no_warnings(name):
   env_checker.check_env(_make(name), skip_render_check=True)
 
 
-def test_the_checker_has_no_warnings_about_flat_observations():
-  env = _make(flat=True, reward_register='reward', **_DISCRETE)
+@pytest.mark.parametrize('classes', ['all', 'present'])
+def test_the_checker_has_no_warnings_about_flat_observations(classes):
+  env = _make(flat=True, classes=classes, reward_register='reward', **_DISCRETE)
   env_checker.check_env(env, skip_render_check=True)
 
 
@@ -111,6 +115,98 @@ def test_observations_have_no_slashes_no_empty_shapes_and_classes():
   assert exact.action_space.dtype == np.float64
 
 
+# Worlds with the codes of their specs after the 11 that all worlds list. The
+# secure twin of each world has the same codes.
+_CODES_AFTER_11 = {
+    'UnlockDoor-near-InstantaneousReward-v3': (),
+    'UnlockDoor-boxed-ValueAdvice-v3': (),
+    'Gates-standard-InstantaneousReward-v1': (11, 12),
+    'GoodObjects-member_1-InstantaneousReward-v1': (14, 15, 16, 17),
+    'SupervisedRoom-standard-InstantaneousReward-v1': (14, 17, 18),
+}
+
+
+@pytest.mark.parametrize('channel', ['embedded', 'secure'])
+@pytest.mark.parametrize('name', _CODES_AFTER_11)
+def test_a_world_contains_no_class_but_those_of_its_spec(name, channel):
+  codes = np.array([*range(11), *_CODES_AFTER_11[name]])
+  options = {
+      'overrides': [f'channel={channel}'],
+      'environment_kwargs': {'max_steps': 400},
+  }
+  usual, compact = (
+      _make(f'realab/{name}', classes=classes, **options)
+      for classes in ('all', 'present')
+  )
+  key = 'senses_ray_classes'
+  assert set(compact.observation_space[key].nvec) == {len(codes)}
+  same = {k: space for k, space in usual.observation_space.items() if k != key}
+  rest = {
+      k: space for k, space in compact.observation_space.items() if k != key
+  }
+  assert rest == same
+  compact.action_space.seed(3)
+  expected, found = (env.reset(seed=5)[0] for env in (usual, compact))
+  for _ in range(400):
+    assert found in compact.observation_space
+    np.testing.assert_array_equal(codes[found.pop(key)], expected.pop(key))
+    _assert_same(found, expected)
+    action = compact.action_space.sample()
+    expected, found = (env.step(action)[0] for env in (usual, compact))
+
+
+@pytest.mark.parametrize(
+    ('name', 'all_classes', 'present'),
+    [
+        ('UnlockDoor-near-InstantaneousReward-v3', 1067, 395),
+        ('GoodObjects-member_1-InstantaneousReward-v1', 1067, 523),
+    ],
+)
+def test_sizes_of_flat_observations(name, all_classes, present):
+  for classes, size in (('all', all_classes), ('present', present)):
+    env = _make(f'realab/{name}', flat=True, classes=classes)
+    assert env.observation_space.shape == (size,)
+    envs = gym.make_vec(
+        f'realab/{name}', num_envs=2, flat=True, classes=classes
+    )
+    assert envs.observation_space.shape == (2, size)
+
+
+def test_classes_of_an_author_are_present_in_the_worlds_that_contain_them(
+    monkeypatch,
+):
+  monkeypatch.setattr(appearance, '_CLASSES', dict(appearance._CLASSES))
+  appearance.register('rock', code=29)
+  task = collect_apples.CollectApples('near')
+  rocks = mjcf.RootElement(model='rocks')
+  rocks.default.geom.set_attributes(
+      **appearance.geom_style('rock', (0.5, 0.5, 0.5, 1.0))
+  )
+  for x, y in ((2, 0), (-2, 0), (0, 2), (0, -2)):
+    rocks.worldbody.add('geom', type='box', size=(1, 1, 1), pos=(x, y, 0))
+  task.root_entity.mjcf_model.attach(rocks)
+  env = suite.embed(task, 'none', random=0)
+  compact = single.RealabEnv(env, classes='present')
+  key = 'senses_ray_classes'
+  # The last of the 11 classes of each world and this one.
+  assert set(compact.observation_space[key].nvec) == {12}
+  assert 11 in compact.reset()[0][key]
+
+
+def test_a_class_that_its_spec_does_not_list_is_refused():
+  spec = {'rays': appearance.ClassArray((2, 3), (0, 31, 1))}
+  codec = codecs.ObservationCodec(spec, classes='present')
+  listed = {'rays': np.array([[0, 1, 31], [1, 1, 0]], np.int32)}
+  found = codec.encode(listed)['rays']
+  assert found.tolist() == [[0, 1, 2], [1, 1, 0]]
+  for code in (7, 32, -1):
+    unlisted = {'rays': np.full((2, 3), code, np.int32)}
+    with pytest.raises(
+        errors.SpecError, match=rf'^rays: class {code}; .*\[0, 1, 31\]$'
+    ):
+      codec.encode(unlisted)
+
+
 def test_arguments_of_the_task_select_its_substeps():
   light = ['registers.reward.mass=0.01']
   kwargs = {'physics_timestep': 0.01}
@@ -120,9 +216,10 @@ def test_arguments_of_the_task_select_its_substeps():
     make(_NEAR, overrides=light, task_kwargs=kwargs, **options).close()
 
 
-def test_a_flat_observation_is_that_of_gymnasiums_wrapper():
-  flat = _make(flat=True)
-  wrapped = gym.wrappers.FlattenObservation(_make())
+@pytest.mark.parametrize('classes', ['all', 'present'])
+def test_a_flat_observation_is_that_of_gymnasiums_wrapper(classes):
+  flat = _make(flat=True, classes=classes)
+  wrapped = gym.wrappers.FlattenObservation(_make(classes=classes))
   assert flat.observation_space == wrapped.observation_space
   for env in (flat, wrapped):
     env.action_space.seed(2)
@@ -196,7 +293,7 @@ def test_actions_of_another_shape_or_type_are_refused(action):
         ({'flat': 'yes'}, "flat: must be .*'yes'"),
         ({'height': 1.5}, r'height: must be .*1\.5'),
         ({'camera_name': 'nowhere'}, 'camera'),
-        ({'colour': 'red'}, "unknown key 'colour'"),
+        ({'classes': 'some'}, "classes: must be 'all' or 'present'"),
     ],
 )
 def test_wrong_options_are_refused(options, message):
@@ -226,10 +323,12 @@ def test_options_may_be_values_of_numpy(flat, dtype):
 def test_a_wrong_option_is_told_all_options(option, hint):
   of_batches = ('num_threads', 'sleep', 'autoreset_mode')
   for make, options in ((gym.make, {}), (gym.make_vec, {'num_envs': 2})):
-    with pytest.raises(errors.SpecError, match=f"key '{option}'") as raised:
+    words = f"^options: unexpected keyword argument '{option}'"
+    with pytest.raises(errors.UnknownOptionError, match=words) as raised:
       make(_NEAR, **options, **{option: 2})
+    # Gymnasium adds the arguments of the entry point.
     hinted, listed = str(raised.value).split('(allowed: ')
-    allowed = listed.rstrip(')').split(', ')
+    allowed = listed.partition(')')[0].split(', ')
     assert {
         'design', 'overrides', 'task_kwargs', 'environment_kwargs', 'flat',
         'reward_register',
@@ -238,6 +337,23 @@ def test_a_wrong_option_is_told_all_options(option, hint):
     assert [name in allowed for name in of_batches] == [is_batch] * 3
     if hint in allowed:
       assert f'did you mean {hint!r}?' in hinted
+
+
+def test_an_unknown_option_is_a_type_error_of_one_line():
+  env = suite.load('unlock_door', 'near')
+  batch = suite.load_batch('unlock_door', 'near', num_envs=2)
+  words = (
+      r"^options: unexpected keyword argument 'frameskip' \(allowed: "
+      r'.*reward_register, dtype, flat, .*\)$'
+  )
+  for adapt in (
+      lambda: single.RealabEnv(env, frameskip=2),
+      lambda: vector.RealabVectorEnv(batch, frameskip=2),
+      lambda: registration.make('unlock_door', 'near', frameskip=2),
+  ):
+    with pytest.raises(TypeError, match=words) as raised:
+      adapt()
+    assert isinstance(raised.value, errors.SpecError)
 
 
 @pytest.mark.parametrize(
@@ -313,18 +429,23 @@ def _assert_same(found: Any, expected: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ('mode', 'flat'),
+    ('mode', 'flat', 'classes'),
     [
-        ('NextStep', False),
-        ('NextStep', True),
-        ('SameStep', False),
-        ('SameStep', True),
-        ('Disabled', False),
-        ('Disabled', True),
+        ('NextStep', False, 'all'),
+        ('NextStep', True, 'all'),
+        ('SameStep', False, 'all'),
+        ('SameStep', True, 'all'),
+        ('SameStep', False, 'present'),
+        ('SameStep', True, 'present'),
+        ('Disabled', False, 'all'),
+        ('Disabled', True, 'all'),
     ],
 )
-def test_a_batch_does_what_gymnasiums_vector_of_its_worlds_does(mode, flat):
-  envs, sync = _make_vec(mode, flat=flat), _sync(mode, flat=flat)
+def test_a_batch_does_what_gymnasiums_vector_of_its_worlds_does(
+    mode, flat, classes
+):
+  envs = _make_vec(mode, flat=flat, classes=classes)
+  sync = _sync(mode, flat=flat, classes=classes)
   assert envs.single_observation_space == sync.single_observation_space
   assert envs.observation_space == sync.observation_space
   assert envs.action_space == sync.action_space

@@ -1,12 +1,13 @@
 """Spaces, conversions and pictures: what one world and a batch share."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Annotated, Any, Literal, final
 
 from dm_control import composer
 import numpy as np
 import pydantic
 
+from realab_suite import errors
 from realab_suite.config import integers
 from realab_suite.config import validation
 from realab_suite.engine import agent_view
@@ -51,6 +52,8 @@ class Options(validation.Model):
       for a reward of 0.0.
     dtype: Type of floats in observations and actions.
     flat: True for observations that are one vector for each world.
+    classes: Classes of objects in observations: `'all'` that can be registered,
+      or `'present'` for those that the spec of the world lists.
     render_mode: `'rgb_array'`, or `None`. Frames are for people.
     camera_name: Camera of the frames; `None` for `'top_down'`, or a free camera
       in a single world without it.
@@ -62,11 +65,31 @@ class Options(validation.Model):
   reward_register: Any = None
   dtype: _DType = 'float32'
   flat: _Flag = False
+  classes: codecs.Classes = 'all'
   # Not `| None`, which the error message would leave out.
   render_mode: Literal['rgb_array', None] = None
   camera_name: str | None = None
   height: _Integer = 240
   width: _Integer = 320
+
+
+def check_names(given: Collection[str], allowed: Collection[str]) -> None:
+  """Checks the names of keyword arguments.
+
+  The message has the words of Python, for which TorchRL looks when it tries out
+  keyword arguments.
+
+  Args:
+    given: Names of the keyword arguments.
+    allowed: Allowed names.
+
+  Raises:
+    UnknownOptionError: If a name is not allowed.
+  """
+  try:
+    validation.check_keys(given, allowed, 'unexpected keyword argument')
+  except ValueError as error:
+    raise errors.UnknownOptionError(f'options: {error}') from None
 
 
 @final
@@ -98,10 +121,13 @@ class Interface:
     Raises:
       SpecError: If an option is invalid.
     """
+    check_names(options, Options.model_fields)
     chosen = validation.validate(Options, options, 'options')
     spec = view.observation_spec()
     self.reward_key = codecs.reward_key(chosen.reward_register, spec)
-    self.observations = codecs.ObservationCodec(spec, chosen.dtype, chosen.flat)
+    self.observations = codecs.ObservationCodec(
+        spec, chosen.dtype, chosen.flat, chosen.classes
+    )
     self.actions = codecs.ActionCodec(view.action_spec(), chosen.dtype)
     self.metadata = {
         'render_modes': ['rgb_array'],

@@ -10,7 +10,6 @@ import gymnasium as gym
 from realab_suite import errors
 from realab_suite import suite
 from realab_suite.config import messages
-from realab_suite.config import validation
 from realab_suite.feedback import specs
 from realab_suite.interop.gymnasium import interfaces
 from realab_suite.interop.gymnasium import single
@@ -146,10 +145,7 @@ def _adapted(
       *(['autoreset_mode'] if adapter is vector.RealabVectorEnv else []),
       *interfaces.Options.model_fields,
   ]
-  try:
-    validation.check_keys(rest, allowed)
-  except ValueError as error:
-    raise messages.Location('options').error(str(error)) from error
+  interfaces.check_names(rest, allowed)
   loaded = load(**{key: options[key] for key in options if key in of_load})
   try:
     return adapter(loaded, **rest)
