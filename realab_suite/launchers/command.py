@@ -12,7 +12,7 @@ import runpy
 import subprocess
 import sys
 
-import realab_suite
+from realab_suite import __version__
 from realab_suite.config import messages
 from realab_suite.experiments import requirements
 from realab_suite.launchers import program
@@ -74,7 +74,7 @@ def main() -> int:
     return 0 if arguments else program.USAGE_ERROR
   name, *rest = arguments
   if name == '--version':
-    sys.stdout.write(f'realab_suite {realab_suite.__version__}\n')
+    sys.stdout.write(f'realab_suite {__version__}\n')
     return 0
   if name not in COMMANDS:
     hint = messages.did_you_mean(name, (*COMMANDS, 'help', '--version'))
