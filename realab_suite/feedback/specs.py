@@ -1,6 +1,6 @@
 """Specs of agent designs, and how to load them (paper, section 3.2)."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 import functools
 from typing import Annotated, Any, Literal, final
 
@@ -187,6 +187,8 @@ class ScheduleSpec(validation.Spec):
 class ActionSetSpec(validation.Spec):
   """Reference to a set of discrete actions.
 
+  The name alone refers to the newest version, which becomes part of the spec.
+
   Attributes:
     name: Name of the action set.
     version: Version of the action set.
@@ -194,6 +196,20 @@ class ActionSetSpec(validation.Spec):
 
   name: Name
   version: int
+
+  @pydantic.model_validator(mode='before')
+  @classmethod
+  def _find_newest(cls, data: Any) -> Any:
+    if isinstance(data, str):
+      return {'name': data, 'version': action_sets.newest(data).version}
+    if not isinstance(data, Mapping | ActionSetSpec):
+      raise ValueError('must be a name, or a mapping with name and version')
+    return data
+
+  @classmethod
+  def __get_pydantic_json_schema__(cls, schema: Any, handler: Any) -> Any:
+    name = pydantic.TypeAdapter(Name).json_schema()
+    return {'anyOf': [name, handler(schema)]}
 
   @pydantic.model_validator(mode='after')
   def _known(self) -> 'ActionSetSpec':

@@ -167,6 +167,23 @@ def get(name: str, version: int) -> ActionSet:
   return ACTION_SETS.get(_key(name, version))
 
 
+def newest(name: str) -> ActionSet:
+  """Returns the newest version of the action set called `name`.
+
+  Raises:
+    UnknownNameError: If the set is unknown.
+  """
+  versions = [ACTION_SETS.get(key) for key in ACTION_SETS]
+  named = [actions for actions in versions if actions.name == name]
+  if not named:
+    known = sorted({actions.name for actions in versions})
+    raise errors.UnknownNameError(
+        f'action set {messages.quote(name)} is unknown'
+        f'{messages.did_you_mean(name, known)}; known are {known}'
+    )
+  return max(named, key=lambda actions: actions.version)
+
+
 def _key(name: str, version: int) -> str:
   return f'{name} v{version}'
 

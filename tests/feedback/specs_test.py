@@ -13,6 +13,8 @@ from realab_suite import suite
 from realab_suite.feedback import providers
 from realab_suite.feedback import register_kinds
 from realab_suite.feedback import specs
+from realab_suite.policies import action_sets
+from tests import registries
 from tests.engine import helpers
 from tests.feedback import designs
 from tests.feedback import stubs
@@ -193,6 +195,47 @@ def test_the_channel_of_a_twin_replaces_those_of_its_registers(whole, found):
   assert channels == found
 
 
+# Action sets.
+
+
+@pytest.mark.parametrize(
+    ('design', 'overrides'),
+    [
+        ({**designs.SCORED, 'action_set': 'walk'}, ()),
+        (designs.SCORED, ('action_set=walk',)),
+    ],
+)
+def test_the_name_of_an_action_set_is_enough(design, overrides):
+  stated = {**designs.SCORED, 'action_set': {'name': 'walk', 'version': 1}}
+  spec, expected = specs.load(design, overrides), specs.load(stated)
+  assert spec == expected
+  assert spec.digest() == expected.digest()
+
+
+def test_the_name_of_an_action_set_is_its_newest_version():
+  with registries.preserved():
+    for version in (11, 2, 9):
+      action_sets.register(
+          action_sets.ActionSet('walk', version, (('wait', {}),))
+      )
+    spec = specs.load(designs.changed('action_set=walk'))
+    assert spec.to_mapping()['action_set'] == {'name': 'walk', 'version': 11}
+
+
+@pytest.mark.parametrize(
+    ('given', 'complaint'),
+    [
+        ('wlk', "'wlk' is unknown; did you mean 'walk'?; known are ['dmlab_"),
+        ('3', 'must be a name, or a mapping with name and version, got 3'),
+        ('{name: walk}', 'action_set.version: required key is missing'),
+    ],
+)
+def test_what_names_no_action_set_is_refused(given, complaint):
+  with pytest.raises(errors.SpecError) as raised:
+    specs.load(designs.SCORED, [f'action_set={given}'])
+  assert complaint in str(raised.value)
+
+
 # The JSON Schema, and registered kinds.
 
 
@@ -204,6 +247,8 @@ def test_the_json_schema_has_every_key_and_every_shipped_provider():
   text = json.dumps(schema)
   for kind in providers.PROVIDERS:
     assert f'"const": "{kind}"' in text
+  forms = schema['$defs']['ActionSetSpec']['anyOf']
+  assert [form['type'] for form in forms] == ['string', 'object']
 
 
 @final
