@@ -36,7 +36,7 @@ lint: .venv/dev
 	  wait $$types && exit $$formatted
 
 docs: .venv/docs
-	@echo 'Building the site; this takes about a minute.'
+	@echo 'Building the site; this takes a minute or two.'
 	$(PY) -m sphinx -j auto -W --keep-going -q -c docs/site . build/site
 	@echo 'The site is build/site/docs/site/index.html'
 
@@ -51,7 +51,7 @@ clean:
 
 # Stamp files: packages are installed again only if a prerequisite changes.
 .venv/demo: setup.cfg pyproject.toml constraints.txt | .venv/made
-	@echo 'Installing realab_suite into .venv; this takes about a minute.'
+	@echo 'Installing realab_suite into .venv; this takes a minute or two.'
 	@$(INSTALL_LABMAZE)
 	@$(INSTALL) -e '.[agents,report]'
 	@touch $@

@@ -64,9 +64,7 @@ def test_absolute_values_in_docstrings_are_escaped(catalogue):
 
 def test_modules_are_listed_by_package_with_descriptions(catalogue):
   tasks = 'realab_suite.tasks'
-  packages = catalogue._packages(
-      ['realab_suite.suite', tasks, f'{tasks}.base']
-  )
+  packages = catalogue._packages(['realab_suite.suite', tasks, f'{tasks}.base'])
   text = catalogue._index(packages)
   first, second = text.split('## realab_suite.tasks\n')
   assert '| [realab_suite.suite](#realab_suite.suite) |' in first
