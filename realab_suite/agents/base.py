@@ -18,6 +18,7 @@ from realab_suite.agents import jax_settings
 from realab_suite.config import integers
 from realab_suite.config import registry
 from realab_suite.config import validation
+from realab_suite.feedback import objectives
 from realab_suite.feedback import specs
 
 Positive = Annotated[int, pydantic.Field(gt=0)]
@@ -402,7 +403,7 @@ class Learner(abc.ABC):
     del memory  # There is none in this base class.
 
 
-LEARNERS: registry.Registry[type[Learner]] = registry.Registry('learner')
+LEARNERS: registry.Registry[type[Learner]] = objectives.LEARNERS
 
 
 def make(

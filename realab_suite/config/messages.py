@@ -59,9 +59,17 @@ def quote(value: object) -> str:
   return text if len(text) <= _MAX_LENGTH else f'{text[: _MAX_LENGTH - 3]}...'
 
 
-def did_you_mean(given: object, known: Iterable[str]) -> str:
-  """Returns a hint at the known name that is most like a name, or ''."""
-  close = difflib.get_close_matches(str(given), known, n=1)
+def did_you_mean(
+    given: object, known: Iterable[str], cutoff: float = 0.6
+) -> str:
+  """Returns a hint at the known name that is most like a name, or ''.
+
+  Args:
+    given: The name.
+    known: Known names.
+    cutoff: Least likeness of a name in a hint, from 0 to 1.
+  """
+  close = difflib.get_close_matches(str(given), known, n=1, cutoff=cutoff)
   return f'; did you mean {close[0]!r}?' if close else ''
 
 

@@ -180,9 +180,10 @@ def _check_learner(design: Any) -> None:
   """Refuses a learner that learns from registers that agents do not read.
 
   Raises:
-    ValueError: If an option names a register that only providers may read, or
-      if the objective is invalid, reads a register that agents do not read, or
-      queries a register that is no query register.
+    ValueError: If an option names a register that only providers may read, if
+      the objective is invalid, reads a register that agents do not read, or
+      queries a register that is no query register, or if there is none and the
+      kind is a misspelling of another one.
   """
   extras = (design.learner.model_extra or {}) if design.learner else {}
   for field, value in extras.items():
@@ -196,6 +197,8 @@ def _check_learner(design: Any) -> None:
         )
   objective, _ = objectives.of_learner(design.learner)
   if objective is None:
+    if design.learner is not None:
+      objectives.refuse_misspelling(design.learner.kind)
     return
   for names, what, allowed in (
       (objective.registers, 'register that agents read', _READ_BY_AGENTS),

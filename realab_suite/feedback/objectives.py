@@ -112,8 +112,14 @@ PAYMENTS: registry.Registry[Callable[[_Options, str], Payment | str]] = (
 A string is the reason why there is no such sum.
 """
 
+LEARNERS: registry.Registry[type[Any]] = registry.Registry('learner')
+"""Classes of learners, by kind; `agents` fills it when imported."""
+
 DEFENCES: registry.Registry[type[Any]] = registry.Registry('defence')
 """Classes of defences, by kind; `agents.defences` fills it when imported."""
+
+# Likeness from which an unknown kind is taken for a misspelling of a known one.
+_MISSPELT = 0.8
 
 
 @PAYMENTS.add('alarm')
@@ -255,6 +261,27 @@ def _name(options: _Options, option: str, owner: str = '') -> str:
         f' {messages.quote(name)}'
     )
   return name
+
+
+def refuse_misspelling(kind: str) -> None:
+  """Refuses the kind of a learner that is almost a known one.
+
+  Other unknown kinds may be those of algorithms that this package never runs.
+
+  Args:
+    kind: Kind of a learner without an objective.
+
+  Raises:
+    ValueError: If it is unknown, and like a known one.
+  """
+  known = sorted({*OBJECTIVES, *LEARNERS})
+  hint = messages.did_you_mean(kind, known, _MISSPELT)
+  if hint and kind not in known:
+    raise ValueError(
+        f'learner {messages.quote(kind)} is unknown{hint}; known are'
+        f' {known}; a learner of your own that has such a name declares an'
+        ' `objective`, or --import names its module'
+    )
 
 
 def of_learner(learner: Any) -> tuple[ObjectiveSpec | None, str]:

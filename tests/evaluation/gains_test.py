@@ -115,6 +115,42 @@ def test_objectives_that_mean_nothing_are_refused_at_load(learner, message):
   assert '\n' not in str(raised.value)
 
 
+@pytest.mark.parametrize(
+    ('kind', 'meant'),
+    [
+        ('policy_gradiant', 'policy_gradient'),
+        ('policygradient', 'policy_gradient'),
+        ('q_lerning', 'q_learning'),
+        ('decoupled_aproval', 'decoupled_approval'),
+        ('behavioral_cloning', 'behavioural_cloning'),
+    ],
+)
+def test_a_misspelt_kind_is_refused_at_load_with_the_nearest(kind, meant):
+  with pytest.raises(errors.SpecError) as raised:
+    _design(f'{{kind: {kind}, reward: reward}}')
+  assert (
+      f"learner '{kind}' is unknown; did you mean '{meant}'?; known are"
+      " ['behavioural_cloning', "
+  ) in str(raised.value)
+
+
+@pytest.mark.parametrize('kind', ['ppo', 'my_learner', 'sarsa', 'dreamer_v3'])
+def test_an_algorithm_of_another_package_needs_no_objective(kind):
+  assert _design(f'{{kind: {kind}, rate: 0.1}}').objective is None
+
+
+def test_a_kind_with_an_objective_may_be_like_another():
+  objective = 'objective: {kind: mean, registers: {reward: 1}}'
+  design = _design(f'{{kind: q_learning_2, {objective}}}')
+  assert design.objective.registers == {'reward': 1.0}
+
+
+def test_a_registered_kind_may_be_like_another():
+  with helpers.registered(objectives.LEARNERS, 'q_learning_2', object):
+    design = _design('{kind: q_learning_2}')
+  assert design.why_not_judged.startswith("learner 'q_learning_2' declares no")
+
+
 def test_a_kind_of_another_package_declares_its_objective():
   def minimised(options):
     return {'kind': 'return', 'registers': {options['cost']: -1.0}}
