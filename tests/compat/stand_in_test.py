@@ -32,7 +32,7 @@ def _run(*arguments):
   path = os.pathsep.join(map(os.fspath, (_COMPAT, _COMPAT.parents[1])))
   return subprocess.run(
       [sys.executable, *arguments],
-      env={**os.environ, 'PYTHONPATH': path},
+      env={**os.environ, 'PYTHONPATH': path, 'MUJOCO_GL': 'egl'},
       capture_output=True,
       text=True,
       check=False,
@@ -63,6 +63,8 @@ def _labmaze():
   sys.modules.update(hidden)
 
 
+@pytest.mark.camera
+@pytest.mark.usefixtures('egl')
 def test_the_tests_of_mazes_that_dm_control_ships_pass():
   [folder] = importlib.util.find_spec('dm_control').submodule_search_locations
   locomotion = pathlib.Path(folder) / 'locomotion'
@@ -77,6 +79,7 @@ def test_the_tests_of_mazes_that_dm_control_ships_pass():
 
 
 @pytest.mark.camera
+@pytest.mark.usefixtures('egl')
 def test_examples_of_dm_control_render_and_rows_name_the_stand_in():
   ran = _run('-c', _EXAMPLES)
   assert ran.stdout.startswith('True '), ran.stderr

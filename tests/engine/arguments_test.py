@@ -118,7 +118,7 @@ _LOADED = {
     ),
     'task_name': (
         lambda v: suite.load('collect_apples', v),
-        'task collect_apples.', _NO_INTEGERS_OR_NONE,
+        'task collect_apples', _NO_INTEGERS_OR_NONE,
     ),
     'design': (lambda v: suite.load(*_WORLD, design=v), 'design', _FEW),
     'design of embed': (lambda v: suite.embed(_TASK, v), 'design', _NO_TEXTS),
