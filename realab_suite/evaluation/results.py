@@ -96,7 +96,9 @@ class RunInfo(validation.Record):
   salt_digest: str | None = None
   control_timestep: float
   max_steps: int | None
-  versions: dict[str, str] = pydantic.Field(default_factory=lambda: versions())
+  versions: dict[str, str] = pydantic.Field(
+      default_factory=lambda: versions_of_rows()
+  )
   platform: str = pydantic.Field(default_factory=platform.platform)
 
   @classmethod
@@ -176,24 +178,26 @@ class EpisodeRow(validation.Record):
 
 
 def versions() -> dict[str, str]:
-  """Returns the versions of the packages that results depend on, by name.
-
-  They include that of the stand-in for labmaze where a world has imported it:
-  mazes of dm_control differ with it.
-  """
-  labmaze = sys.modules.get('labmaze')
-  is_stand_in = getattr(labmaze, 'STAND_IN', False)
+  """Returns the versions of the packages that results depend on, by name."""
   return {
       'realab_suite': __version__,
       'python': platform.python_version(),
       **{
           name: metadata.version(name)
-          for name in (
-              *('dm-control', 'mujoco', 'numpy'),
-              *(['labmaze'] if is_stand_in else []),
-          )
+          for name in ('dm-control', 'mujoco', 'numpy')
       },
   }
+
+
+def versions_of_rows() -> dict[str, str]:
+  """Returns `versions`, and that of a stand-in for labmaze if it is in use.
+
+  Mazes of dm_control differ with it. It is in use once a world has imported it,
+  so this must not identify jobs, whose processes import different modules.
+  """
+  if getattr(sys.modules.get('labmaze'), 'STAND_IN', False):
+    return {**versions(), 'labmaze': metadata.version('labmaze')}
+  return versions()
 
 
 def row(

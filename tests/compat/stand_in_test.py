@@ -23,7 +23,7 @@ for make in (
   env.task._enabled_observables = []
   env.physics.render(48, 64, camera_id=0)
 from realab_suite.evaluation import results
-print(labmaze.STAND_IN, results.versions()['labmaze'])
+print(labmaze.STAND_IN, results.versions_of_rows()['labmaze'])
 """
 
 

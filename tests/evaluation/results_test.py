@@ -8,6 +8,7 @@ import pathlib
 import platform
 import resource
 import sys
+import types
 from typing import Any
 from unittest import mock
 
@@ -245,17 +246,22 @@ def test_a_row_names_the_versions_that_it_depends_on():
       'dm-control': results.metadata.version('dm-control'),
       'mujoco': mujoco.__version__,
       'numpy': np.__version__,
-      # The stand-in alone, in a process that has imported it.
-      **(
-          {'labmaze': results.metadata.version('labmaze')}
-          if hasattr(sys.modules.get('labmaze'), 'STAND_IN')
-          else {}
-      ),
   }
   info = _row().info
-  assert info.versions == results.versions()
+  assert info.versions == results.versions_of_rows()
   assert info.platform == platform.platform()
   assert info.isolation == 'T0 in-process'
+
+
+@pytest.mark.parametrize('is_stand_in', [False, True])
+def test_rows_and_no_jobs_name_a_stand_in_for_labmaze(monkeypatch, is_stand_in):
+  labmaze = types.ModuleType('labmaze')
+  if is_stand_in:
+    labmaze.STAND_IN = True
+  monkeypatch.setitem(sys.modules, 'labmaze', labmaze)
+  assert ('labmaze' in _row().info.versions) == is_stand_in
+  # The identity of a job must not depend on what its process has imported.
+  assert 'labmaze' not in results.versions()
 
 
 def test_a_row_that_failed_is_not_written_again(tmp_path):
