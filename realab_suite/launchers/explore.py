@@ -41,7 +41,7 @@ def _open_window() -> None:
   # This and later imports need a renderer to be chosen first.
   from dm_control import viewer
 
-  with _loaded(_policy_name()) as (env, policy):
+  with _loaded() as (env, policy, _):
     viewer.launch(env, policy=_as_function(policy, env), title='realab_suite')
 
 
@@ -54,24 +54,28 @@ def _write_film() -> None:
   from realab_suite.experiments import tracking
   from realab_suite.reports import films
 
-  world, name = '_'.join(flags.domain_and_task()), _policy_name()
-  path = flags.VIDEO.value or _unused(f'{world}_{name}_{flags.SEED.value}')
-  program.say(f'Filming an episode of {name}; it takes up to minutes')
-  with (
-      _loaded(name) as (env, policy),
-      films.film(env, path, name) as add,
-  ):
-    recorder = tracking.Tracker(env, add)
-    evaluate.evaluate(env, policy, 1, sinks=[recorder])
+  # Domains such as dm_control/cartpole have a slash.
+  world = '_'.join(flags.domain_and_task()).replace('/', '_')
+  with _loaded() as (env, policy, name):
+    path = flags.VIDEO.value or _unused(f'{world}_{name}_{flags.SEED.value}')
+    program.say(f'Filming an episode of {name}; this may take minutes')
+    with films.film(env, path, name) as add:
+      recorder = tracking.Tracker(env, add)
+      evaluate.evaluate(env, policy, 1, sinks=[recorder])
   program.say(f'The film is {path}')
 
 
-def _policy_name() -> str:
-  """Returns the policy of the flags, or else a saboteur of the world."""
-  if flags.POLICY.present:
+def _policy_name(env: Any) -> str:
+  """Returns the policy of the flags, or else a saboteur of the world.
+
+  Random actions are shown where the world, such as one of dm_control, has no
+  saboteur, or where the design has no register to attack.
+  """
+  saboteurs = getattr(env.task, 'SABOTEURS', ())
+  is_attackable = bool(env.mechanism.design.names('feedback'))
+  if flags.POLICY.present or not (saboteurs and is_attackable):
     return str(flags.POLICY.value)
-  saboteurs = flags.world().saboteurs
-  return saboteurs[0] if saboteurs else str(flags.POLICY.value)
+  return str(saboteurs[0])
 
 
 def _unused(stem: str) -> str:
@@ -85,16 +89,17 @@ def _unused(stem: str) -> str:
 
 
 @contextlib.contextmanager
-def _loaded(name: str) -> Iterator[tuple[Any, Any]]:
-  """Yields the environment that the flags name, and a policy by its name."""
+def _loaded() -> Iterator[tuple[Any, Any, str]]:
+  """Yields the environment of the flags, a policy, and its name."""
   from realab_suite.audit import aiming
 
   flags.load_imports()
   env = flags.world().load(flags.design(), flags.SEED.value)
   with contextlib.closing(env):
+    name = _policy_name(env)
     policy = aiming.make_policy(name, env, flags.TARGET.value, 0)
     env.rewind()
-    yield env, policy
+    yield env, policy, name
 
 
 def _as_function(policy: Any, env: Any) -> Callable[[dm_env.TimeStep], Any]:

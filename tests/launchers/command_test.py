@@ -228,6 +228,22 @@ def test_exploring_without_a_display_makes_a_film(tmp_path):
   assert film.stat().st_size > 5_000
 
 
+@pytest.mark.parametrize(
+    ('flags_of_world', 'name'),
+    [
+        ((), 'carrying_saboteur'),
+        (('--policy=random',), 'random'),
+        (('--design=none',), 'random'),
+        (('--task=dm_control/cartpole.balance', '--design=none'), 'random'),
+    ],
+)
+def test_a_saboteur_is_shown_where_it_can_attack(flags_of_world, name):
+  with flagsaver.flagsaver():
+    absl_flags.FLAGS(['explore', *flags_of_world])
+    with explore._loaded() as (_, _, shown):
+      assert shown == name
+
+
 def test_with_a_display_the_viewer_gets_a_world_and_a_policy(monkeypatch):
   lengths = []
 
