@@ -24,15 +24,16 @@ def check_tensorboard() -> None:
 class Pace:
   """Makes a line on the progress of many jobs, from time to time."""
 
-  def __init__(self, total: int, now: float) -> None:
+  def __init__(self, total: int, steps: int, now: float) -> None:
     """Starts the clock.
 
     Args:
       total: Number of control steps of all jobs.
+      steps: Number of control steps of earlier runs of the jobs.
       now: Time, in seconds.
     """
     self._total = total
-    self._steps, self._time = 0, now
+    self._steps, self._time = steps, now
 
   def line(self, steps: int, now: float) -> str:
     """Returns a line if the last one was half a minute ago, or else ''.

@@ -244,7 +244,8 @@ class _Sweep:
     """Runs all jobs; see `sweep`."""
     count = len(self._all)
     total = sum(r.job.training.total for r in self._all if not r.job.policy)
-    pace = progress.Pace(total, time.monotonic())
+    done = sum(run.num_steps for run in self._all)
+    pace = progress.Pace(total, done, time.monotonic())
     bar = tqdm.tqdm(total=total, unit='step', unit_scale=True, disable=None)
     with bar:
       try:
