@@ -51,7 +51,7 @@ clean:
 
 # Stamp files: packages are installed again only if a prerequisite changes.
 .venv/demo: setup.cfg pyproject.toml constraints.txt | .venv/made
-	@echo 'Installing realab_suite into .venv; this takes a minute or two.'
+	@echo 'Installing realab_suite into .venv; this takes about a minute.'
 	@$(INSTALL_LABMAZE)
 	@$(INSTALL) -e '.[agents,report]'
 	@touch $@

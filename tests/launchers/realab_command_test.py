@@ -245,3 +245,10 @@ def test_the_doctors_world_can_be_stepped():
   names: dict[str, Any] = {}
   exec(compile(doctor._STEPS_A_WORLD, 'doctor', 'exec'), names)
   assert names['env'].physics.time() > 0
+
+
+def test_the_doctor_names_a_stand_in_for_labmaze(monkeypatch):
+  monkeypatch.setattr(doctor.metadata, 'version', lambda name: '1.0.6')
+  assert 'labmaze' not in doctor.versions()
+  monkeypatch.setattr(doctor.metadata, 'version', lambda name: '1.0.6+realab.1')
+  assert 'labmaze 1.0.6+realab.1, a stand-in' in doctor.versions()
