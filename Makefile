@@ -13,13 +13,23 @@ INSTALL_LABMAZE = if $(PY) -c 'import sys; sys.exit(sys.version_info < (3, 13))'
 	then $(INSTALL) ./compat/labmaze; fi
 WORKERS = 2
 
-.PHONY: help demo test lint docs format clean
+# Files with tests that need other extras than `.venv/dev` has.
+TESTS_OF_EXTRAS = tests/authors tests/datasets tests/engine/gl_test.py \
+	tests/experiments/offline_test.py tests/experiments/played_test.py \
+	tests/experiments/supervised_test.py tests/experiments/training_test.py \
+	tests/interop tests/launchers/data_test.py \
+	tests/reports/replay_pages_test.py
+
+.PHONY: help demo test lint docs check-release format clean
 
 help:
 	@echo 'make demo    train agents in Unlock Door and report which tamper'
 	@echo 'make test    run lint, type checks and tests, as before every merge'
 	@echo 'make lint    run lint and type checks only'
 	@echo 'make docs    build the site in build/site'
+	@echo 'make check-release'
+	@echo '             run the tests of all extras, and every command and code'
+	@echo '             block of README and docs, as before every release'
 	@echo 'make format  format the code and apply the fixes of the linter'
 	@echo 'make clean   remove .venv, builds and caches, but not results/'
 
@@ -39,6 +49,11 @@ docs: .venv/docs
 	@echo 'Building the site; this takes a minute or two.'
 	$(PY) -m sphinx -j auto -W --keep-going -q -c docs/site . build/site
 	@echo 'The site is build/site/docs/site/index.html'
+
+check-release: .venv/extras
+	$(PY) -m pip check
+	$(PY) -m pytest -q -n $(WORKERS) --dist loadfile $(TESTS_OF_EXTRAS)
+	$(PY) -m pytest -q -n $(WORKERS) --dist worksteal -m docs tests/docs
 
 format: .venv/dev
 	$(PY) -m ruff check -q --fix .
@@ -66,6 +81,13 @@ clean:
 
 .venv/docs: .venv/dev
 	@$(INSTALL) -e '.[docs]'
+	@touch $@
+
+# All extras fit into one environment. PyTorch may be one without CUDA.
+.venv/extras: .venv/docs
+	@echo 'Installing all extras, with PyTorch, into .venv; this takes minutes.'
+	@$(INSTALL) torch==2.13.0 torchrl==0.14.1 \
+		-e '.[cluster,browser,data,sb3,tb]'
 	@touch $@
 
 # Debian and Ubuntu ship Python without ensurepip; `venv` then creates an

@@ -3,7 +3,8 @@
 Run from the root of the repository, with the folder of a report on the
 experiment `dial`:
 
-    python -m campaigns.dial_figure results/dial/report docs/images/dial.png
+    realab report --input=results/dial
+    python -m campaigns.dial_figure results/dial docs/images/dial.png
 
 Each panel has the share of the crates that are base blocks of registers on its
 axis. Bars are 95 % intervals over seeds.

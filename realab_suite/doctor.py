@@ -64,7 +64,7 @@ EXTRAS: Mapping[str, Extra] = {
     ),
     'tb': Extra(('tensorboardX',), 'learning curves for TensorBoard'),
     'rpc': Extra(('dm_env_rpc', 'grpc'), 'worlds for other processes'),
-    'gym': Extra(('gymnasium',), 'the interface of Gymnasium'),
+    'gym': Extra(('gymnasium', 'moviepy'), 'the interface of Gymnasium'),
     'sb3': Extra(('stable_baselines3',), 'training with Stable-Baselines3'),
     'data': Extra(
         ('pyarrow', 'minari', 'gymnasium', 'h5py', 'PIL'),

@@ -6,10 +6,12 @@ import re
 import runpy
 import sys
 
+from absl import flags as absl_flags
 import pytest
 import yaml
 
 from pictures import notebooks
+from realab_suite import errors
 from realab_suite import suite
 from realab_suite.evaluation import stakes
 from realab_suite.experiments import experiment_specs
@@ -18,6 +20,7 @@ from realab_suite.feedback import objectives
 from realab_suite.feedback import specs
 from realab_suite.launchers import audit
 from tests import registries
+from tests.docs import pages
 from tests.launchers import in_process
 
 _ROOT = pathlib.Path(__file__).parents[1]
@@ -30,16 +33,21 @@ _PAGES = [
     *_ROOT.glob('docs/*.md'),
     *_ROOT.glob('*/README.md'),
 ]
+# What an experiment needs, for a page that shows a part of one.
+_EXPERIMENT = {
+    'schema': 1,
+    'name': 'page',
+    'task': 'unlock_door.near',
+    'runs': {'reward': {'design': 'instantaneous_reward'}},
+    'seeds': [0],
+}
 # Files of the reader and of results, and the end of a pattern.
 _OTHER_FILES = frozenset({
     '/path/to/agent.py', 'agent.py', 'mine.py', 'mine.yaml', 'watched.yaml',
     '_test.py', 'agent/', 'experiment.yaml', 'summary.md', 'tables.md', 'logs/',
     'tensorboard/', 'calm.py', 'calm.yaml',
+    'results/meter_only_near/experiment.yaml',
 })  # fmt: skip
-
-
-def _python_blocks(path):
-  return re.findall(r'```python\n(.*?)```', path.read_text(), re.DOTALL)
 
 
 @pytest.fixture(name='registries')
@@ -49,54 +57,137 @@ def fixture_registries():
     yield
 
 
-@pytest.mark.parametrize(
-    'page',
-    [
-        'README.md',
-        'docs/attribution.md',
-        'docs/composer.md',
-        'docs/defences.md',
-        'docs/gymnasium.md',
-        'docs/registers.md',
-        'docs/supervision.md',
-        'docs/your_own.md',
-    ],
-)
-def test_python_blocks_of_a_page_run_in_order(page, registries, capsys):
-  if page == 'docs/gymnasium.md':
-    pytest.importorskip('gymnasium')
-  if page == 'docs/defences.md':
-    pytest.importorskip('jax')
-  blocks = _python_blocks(_ROOT / page)
-  assert blocks
+def _is_of_an_evaluator(page):
+  """Returns whether code needs results; then it runs with the commands."""
+  return any('results/' in block.text for block in _blocks(page, 'python'))
+
+
+def _blocks(page, kind):
+  """Returns the blocks of a language that are not the file of a program."""
+  return [
+      piece
+      for piece in pages.pieces(page)
+      if piece.kind == kind and pages.file_of(piece) is None
+  ]
+
+
+def _pages_with_code():
+  for page in pages.all_pages():
+    blocks = _blocks(page, 'python')
+    if blocks and not _is_of_an_evaluator(page):
+      renders = any("'camera'" in block.text for block in blocks)
+      yield pytest.param(page, marks=[pytest.mark.camera] if renders else [])
+
+
+@pytest.mark.parametrize('page', list(_pages_with_code()))
+def test_python_blocks_of_a_page_print_what_it_says(page, registries, capsys):
   names = {'__name__': 'page'}
-  for block in blocks:
-    exec(compile(block, page, 'exec'), names)
-  printed = capsys.readouterr().out
-  assert printed
-  if page == 'docs/your_own.md':
-    for line in (
-        'apple_seeker signal',
-        'carrying_saboteur timeout',
-        'writes 4',
-        'homing: objective 5.9, of which gained 0.0',
-        "{'reward': 1.0, 'fine': -0.5}",
-    ):
-      assert f'{line}\n' in printed
+  output = pages.outputs(page)
+  for block in _blocks(page, 'python'):
+    try:
+      exec(compile(block.text, page, 'exec'), names)
+    except ModuleNotFoundError as error:
+      if error.name in pages.packages_of_extras():
+        pytest.skip(f'{error.name} is in an extra')
+      raise
+    printed = capsys.readouterr().out
+    assert printed == output.get(block.line, printed)
   if page == 'docs/defences.md':
-    one_push, work = 'push' + ' work' * 9, 'work' + ' work' * 9
-    assert printed == f'{one_push}\ntrue 9, off by 5.0 units\n{work}\n'
     # While its defences are registered.
     _check_the_experiment_with_a_defence_of_ones_own()
-  if page == 'docs/attribution.md':
-    assert printed == '1.0\n1.0\n'
-  if page == 'docs/supervision.md':
-    assert printed == '1 1 0.0\n3 3 3.0\n3 2 0.0\n'
+
+
+def test_pages_that_must_show_output_do():
+  shown = {
+      page: ''.join(pages.outputs(page).values()) for page in pages.all_pages()
+  }
+  for line in (
+      'apple_seeker signal',
+      'carrying_saboteur timeout',
+      'writes 4',
+      'homing: objective 5.9, of which gained 0.0',
+      "{'reward': 1.0, 'fine': -0.5}",
+  ):
+    assert f'{line}\n' in shown['docs/your_own.md']
+  one_push, work = 'push' + ' work' * 9, 'work' + ' work' * 9
+  assert shown['docs/defences.md'] == (
+      f'{one_push}\ntrue 9, off by 5.0 units\n{work}\n'
+  )
+  assert "'senses/camera': (4, 32, 32, 3)" in shown['docs/senses.md']
+  assert shown['docs/attribution.md'] == '1.0\n1.0\n'
+  assert shown['docs/supervision.md'] == '1 1 0.0\n3 3 3.0\n3 2 0.0\n'
+
+
+def _load(content):
+  """Loads a design or an experiment, or a part of one in one that is whole."""
+  if isinstance(content, list):
+    content = {'providers': content}
+  if content.keys() & {'runs', 'task', 'training'}:
+    return experiment_specs.load({**_EXPERIMENT, **content})
+  problems = []
+  for name in suite.DESIGNS:
+    try:
+      return specs.load({**specs.load(name).to_mapping(), **content})
+    except errors.RealabError as error:
+      problems.append(f'in {name}: {error}')
+  raise AssertionError('\n'.join(problems))
+
+
+def _yaml_blocks():
+  return [
+      pytest.param(block.text, id=f'{page}:{block.line}')
+      for page in pages.all_pages()
+      for block in _blocks(page, 'yaml')
+  ]
+
+
+@pytest.mark.parametrize('text', _yaml_blocks())
+def test_designs_and_experiments_in_pages_can_be_loaded(
+    text, tmp_path, monkeypatch
+):
+  monkeypatch.chdir(tmp_path)
+  (tmp_path / 'answers.jsonl').touch()  # Those that a person has given.
+  content = yaml.safe_load(text)
+  try:
+    _load(content)
+  except AssertionError:
+    # Providers that no shipped design has together.
+    for provider in content['providers']:
+      _load([provider])
+
+
+def test_flags_in_pages_exist():
+  known = {'help', 'version'}
+  for launcher in (_ROOT / 'realab_suite' / 'launchers').glob('[a-z]*.py'):
+    importlib.import_module(f'realab_suite.launchers.{launcher.stem}')
+  for name, flag in {**absl_flags.FLAGS._flags()}.items():
+    known |= {name, f'no{name}'} if flag.boolean else {name}
+  for folder in ('benchmarks', 'examples'):
+    for path in (_ROOT / folder).glob('*.py'):
+      known |= set(re.findall(r"'--(\w+)'", path.read_text()))
+  mentioned = {
+      (page, flag)
+      for page in pages.all_pages()
+      for flag in re.findall(
+          r'`--(?!xla_)(\w+)', (_ROOT / page).read_text(encoding='utf-8')
+      )
+  }
+  assert mentioned
+  assert not [(page, flag) for page, flag in mentioned if flag not in known]
+
+
+def test_every_code_block_has_a_language():
+  assert not [
+      f'{page}:{piece.line}'
+      for page in pages.all_pages()
+      for piece in pages.pieces(page)
+      if piece.kind not in ('bash', 'python', 'text', 'yaml', 'span')
+  ]
 
 
 def _check_the_experiment_with_a_defence_of_ones_own():
   page = (_ROOT / 'docs/defences.md').read_text()
-  [text] = re.findall(r'```yaml\n(schema: 1\n.*?)```', page, re.DOTALL)
+  [text] = re.findall(r'```yaml\n(# calm.yaml\n.*?)```', page, re.DOTALL)
   experiment = experiment_specs.load(yaml.safe_load(text))
   assert len(jobs.plan(experiment)) == 6
   design = experiment.designs['calm']
@@ -154,15 +245,6 @@ def test_the_tutorial_of_a_world_can_be_followed(
     del sys.modules['gate_world']
 
 
-@pytest.mark.camera
-def test_python_blocks_of_the_page_on_senses_run_in_order(registries, capsys):
-  names = {'__name__': 'page'}
-  for block in _python_blocks(_ROOT / 'docs/senses.md'):
-    assert len(block.splitlines()) < _MAX_LINES, block
-    exec(compile(block, 'docs/senses.md', 'exec'), names)
-  assert "'senses/camera': (4, 32, 32, 3)" in capsys.readouterr().out
-
-
 @pytest.mark.parametrize('name', ['your_own_agent', 'your_own_design'])
 def test_a_notebook_prints_its_stored_output(name, registries, capsys):
   path = _ROOT / 'docs' / 'notebooks' / f'{name}.ipynb'
@@ -183,11 +265,12 @@ def test_the_notebook_with_pictures_prints_its_stored_output(capsys):
   assert capsys.readouterr().out == notebooks.printed(path)
 
 
-def test_every_block_of_your_own_has_under_thirty_lines():
-  blocks = _python_blocks(_ROOT / 'docs/your_own.md')
-  assert len(blocks) >= 5
+@pytest.mark.parametrize('page', ['docs/senses.md', 'docs/your_own.md'])
+def test_every_block_of_a_tutorial_has_under_thirty_lines(page):
+  blocks = _blocks(page, 'python')
+  assert len(blocks) >= 3
   for block in blocks:
-    assert len(block.splitlines()) < _MAX_LINES, block
+    assert len(block.text.splitlines()) < _MAX_LINES, block
 
 
 def test_the_experiment_in_the_docs_can_be_run():

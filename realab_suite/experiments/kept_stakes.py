@@ -1,5 +1,6 @@
 """Stakes in the folder of an experiment, which are measured only once."""
 
+import os
 import pathlib
 from typing import Final
 
@@ -42,5 +43,9 @@ def stakes_of(
   found = worlds.stakes_of(world, design)
   if found is not None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    storage.write_json(path, found.model_dump())
+    # Jobs that start together measure the same stakes at the same time.
+    partial = path.with_suffix(f'.{os.getpid()}')
+    storage.write_json(partial, found.model_dump())
+    with storage.explained(path):
+      os.replace(partial, path)
   return found

@@ -67,6 +67,11 @@ def sweep(
     )
   planned = jobs.plan(experiment, seeds)
   wanted = jobs.plan(experiment, seeds, only) if only else planned
+  # Seed by seed. Learners take longest, so their baselines wait for a processor
+  # that has no learner.
+  wanted = sorted(
+      wanted, key=lambda job: (seeds.index(job.seed), job.policy is not None)
+  )
   with storage.locked(output):
     (output / LOGS).mkdir(exist_ok=True)
     _describe(experiment, planned, calibration, output)

@@ -1,7 +1,7 @@
 r"""Unpacks the jobs of a packed sweep into the folder of a sweep.
 
-  python -m realab_suite.launchers.unpack --input=docs/results/paper.zip \
-    --output=results/paper
+  python -m realab_suite.launchers.unpack --input=docs/results/paper_near.zip \
+    --output=results/paper_near
 
 The folder is new, or that of a sweep of the same experiment, which gets the
 jobs that it lacks. Every file is verified before anything is written.

@@ -85,6 +85,7 @@ def film(
     )
   codec, codec_options, options = _CODECS[suffix]
   try:
+    pathlib.Path(path).parent.mkdir(parents=True, exist_ok=True)
     # The video library would overwrite an existing file.
     open(path, 'x', encoding='utf-8').close()
   except OSError as error:

@@ -100,14 +100,14 @@ def _sweep(experiment, output, engine, **options):
 
 
 @pytest.mark.usefixtures('no_wait')
-def test_every_job_runs_once(tmp_path):
+def test_every_job_runs_once_and_learners_start_first(tmp_path):
   data = {**_SMALL, 'baselines': ['random'], 'seeds': [3, 4]}
   engine = Pretender()
   said = _sweep(data, tmp_path, engine)
   assert engine.commands == [
       (run, seed)
       for seed in (3, 4)
-      for run in ('bad.random', 'bad', 'good.random', 'good')
+      for run in ('bad', 'good', 'bad.random', 'good.random')
   ]
   assert engine.most == 2
   assert said[-1] == f'8 jobs finished; results are in {tmp_path}'

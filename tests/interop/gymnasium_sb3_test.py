@@ -60,10 +60,11 @@ def test_ends_have_a_terminal_observation():
   )
 
 
+@pytest.mark.parametrize('classes', ['all', 'present'])
 @pytest.mark.parametrize('flat', [False, True])
-def test_ppo_learns_from_a_batch(flat):
+def test_ppo_learns_from_a_batch(flat, classes):
   envs = vec_env.VecNormalize(
-      vec_env.VecMonitor(sb3.RealabVecEnv(_make(flat=flat))),
+      vec_env.VecMonitor(sb3.RealabVecEnv(_make(flat=flat, classes=classes))),
       norm_obs_keys=None if flat else ['senses_position'],
   )
   policy = 'MlpPolicy' if flat else 'MultiInputPolicy'
@@ -73,6 +74,9 @@ def test_ppo_learns_from_a_batch(flat):
   model.learn(16)
   assert len(model.ep_info_buffer) == _NUM_ENVS
   assert {info['l'] for info in model.ep_info_buffer} == {_MAX_STEPS}
+  # Of 43 numbers and of 32 rays, each with one entry for a class.
+  num_classes = 11 if classes == 'present' else 32
+  assert model.policy.features_extractor.features_dim == 43 + 32 * num_classes
 
 
 def test_dqn_learns_from_one_world():

@@ -180,12 +180,13 @@ def test_a_film_shows_every_step_and_filming_changes_nothing(tmp_path):
   assert np.ptp(view[0]) > 100
   assert np.abs(view[0].astype(int) - view[-1]).max() > 50
   # An animated picture shows the same, and repeats.
-  with films.film(env, tmp_path / 'film.webp', 'run', ['top_down']) as add:
+  animation = tmp_path / 'new_folder' / 'film.webp'
+  with films.film(env, animation, 'run', ['top_down']) as add:
     recorder = tracking.Tracker(env, add)
     env.add_sink(recorder)
     env.reset()
     env.step(env.action_spec().minimum)
-  with Image.open(tmp_path / 'film.webp') as animated:
+  with Image.open(animation) as animated:
     assert (animated.n_frames, animated.info['loop']) == (2, 0)
     animated.load()
     assert animated.info['duration'] == 100
