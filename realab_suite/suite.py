@@ -226,8 +226,9 @@ def load(
   known = ('max_steps', 'senses', 'world')
   if unknown := [key for key in options if key not in known]:
     raise errors.SpecError(
-        f'environment_kwargs: unknown {messages.quote(unknown)}; allowed are'
-        ' max_steps, senses and world'
+        f'environment_kwargs: unknown {messages.quote(unknown)}'
+        f'{messages.did_you_mean(unknown[0], known)}; allowed are max_steps,'
+        ' senses and world'
     )
   kwargs = _keywords('task_kwargs', task_kwargs)
   random = kwargs.pop('random', None)
@@ -237,8 +238,16 @@ def load(
     raise
   except Exception as error:  # Tasks may raise any class.
     location = messages.Location(f'task_kwargs of {domain_name}.{task_name}')
-    hint = "; the seed is 'random'" if 'seed' in kwargs else ''
-    raise location.error(f'{messages.exception(error)}{hint}') from error
+    known = (*registry.argument_names(factory), 'random')
+    unknown = [key for key in kwargs if key not in known]
+    if isinstance(error, TypeError) and unknown:
+      hint = messages.did_you_mean(unknown[0], known)
+      hint = "; the seed is 'random'" if unknown[0] == 'seed' else hint
+      raise location.error(
+          f'unknown argument {messages.quote(unknown[0])}{hint}; allowed are'
+          f' {list(known)}'
+      ) from error
+    raise location.error(messages.exception(error)) from error
   return embed(
       task,
       'none' if design is None else design,

@@ -10,6 +10,7 @@ import functools
 import hashlib
 import json
 import re
+import types
 from typing import Annotated, Any, Literal, TypeVar
 
 import pydantic
@@ -19,6 +20,15 @@ from realab_suite.config import messages
 
 # Number of problems in a message; the others are counted.
 _MAX_TOLD = 10
+# What is allowed, by the type of the error, where Pydantic has Python's words.
+_IN_WORDS_OF_YAML = {
+    'bool_type': 'true or false',
+    'dict_type': 'a mapping',
+    'list_type': 'a list',
+    'model_attributes_type': 'a mapping',
+    'model_type': 'a mapping',
+    'tuple_type': 'a list',
+}
 # Types of errors of the classes whose objects no file contains.
 _NOT_IN_FILES = ('needs_python_object', 'dataclass_type')
 
@@ -65,6 +75,13 @@ class Model(pydantic.BaseModel, abc.ABC):
       check_keys(
           [key for key in data if key not in fields],
           [field.alias or name for name, field in fields.items()],
+          inner={
+              key: f'{name}.{key}'
+              for name, value in data.items()
+              if name in fields and isinstance(value, Mapping)
+              for key, one in value.items()
+              if isinstance(one, Mapping) == isinstance(data.get(key), Mapping)
+          },
       )
     return data
 
@@ -102,6 +119,7 @@ def check_keys(
     given: Collection[str],
     allowed: Collection[str],
     problem: str = 'unknown key',
+    inner: Mapping[str, str] = types.MappingProxyType({}),
 ) -> None:
   """Checks the keys of a mapping.
 
@@ -109,6 +127,7 @@ def check_keys(
     given: Keys of the mapping.
     allowed: Allowed keys.
     problem: Name of the problem in the message.
+    inner: Keys of the mappings in the mapping, and the paths to them, for hints.
 
   Raises:
     ValueError: If a key is not allowed.
@@ -116,6 +135,8 @@ def check_keys(
   unknown = [key for key in given if key not in allowed]
   if unknown:
     hint = messages.did_you_mean(unknown[0], allowed)
+    if unknown[0] in inner:
+      hint = f'; did you mean {inner[unknown[0]]!r}?'
     raise ValueError(
         f'{problem} {messages.quote(unknown[0])}{hint} (allowed:'
         f' {", ".join(allowed) or "none"})'
@@ -209,6 +230,13 @@ def _problems(error: pydantic.ValidationError, data: Any) -> list[str]:
   found = error.errors(include_url=False)
   # Classes in unions of what a file can contain and what only Python can make.
   told = [one for one in found if one['type'] not in _NOT_IN_FILES] or found
+  # A list with wrong items is too short without them, which is no news.
+  told = [
+      one
+      for one in told
+      if one['type'] != 'too_short'
+      or len(one['input']) < one['ctx']['min_length']
+  ]
   # A union may report a problem once for each of its members.
   return list(
       dict.fromkeys(
@@ -231,21 +259,33 @@ def _path(details: Any, data: Any) -> str:
     except (LookupError, TypeError):
       continue
     path.append(component)
-  if details['type'] == 'missing':
+  if details['type'] == 'missing' and not _is_item(details):
     path.append(details['loc'][-1])
   return messages.format_path(path)
+
+
+def _is_item(details: Any) -> bool:
+  """Returns whether what is missing is an item of a list, and not a key."""
+  return details['type'] == 'missing' and isinstance(details['loc'][-1], int)
 
 
 def _describe(details: Any) -> str:
   """Returns the error message, followed by the value."""
   given = messages.quote(details['input'])
+  if _is_item(details):
+    return f'must have at least {details["loc"][-1] + 1} items, got {given}'
   if details['type'] == 'missing':
     return 'required key is missing'
-  if details['type'] in ('model_type', 'model_attributes_type', 'dict_type'):
-    return f'must be a mapping, got {given}'
+  if details['type'] in _IN_WORDS_OF_YAML:
+    return f'must be {_IN_WORDS_OF_YAML[details["type"]]}, got {given}'
   if 'error' not in details.get('ctx', {}):
     rule = re.sub(r'^\w+ should ', 'must ', details['msg'])
-    return f'{rule}, got {given}'
+    rule = re.sub(r' after validation, not \w+$', '', rule)
+    hint = ''
+    if details['type'] == 'literal_error':
+      known = re.findall(r"'([^']*)'", details['ctx']['expected'])
+      hint = messages.did_you_mean(details['input'], known)
+    return f'{rule}, got {given}{hint}'
   # The message of a validator may have several lines.
   text = ' '.join(str(details['ctx']['error']).split())
   # The problem of a mapping names the wrong part of it already.

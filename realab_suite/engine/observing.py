@@ -179,7 +179,8 @@ def refuse_unknown(selected: Sequence[str], offered: Collection[str]) -> None:
   """Raises a SpecError if a selected sense is not offered."""
   if unknown := [name for name in selected if name not in offered]:
     raise errors.SpecError(
-        f'senses: unknown {messages.quote(unknown)}; this world offers'
+        f'senses: unknown {messages.quote(unknown)}'
+        f'{messages.did_you_mean(unknown[0], offered)}; this world offers'
         f' {list(offered)}'
     )
 

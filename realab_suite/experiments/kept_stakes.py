@@ -1,6 +1,7 @@
 """Stakes in the folder of an experiment, which are measured only once."""
 
-import os
+import contextlib
+import fcntl
 import pathlib
 from typing import Final
 
@@ -35,17 +36,29 @@ def stakes_of(
   if key is None:
     return None
   path = folder / FOLDER / f'{key}.json'
-  if path.exists():
-    content = storage.read_json(path)
-    kept = validation.validate(stakes.Stakes, content, str(path))
-    if kept.key == key:
-      return kept
+  with contextlib.ExitStack() as stack:
+    with storage.explained(path):
+      path.parent.mkdir(parents=True, exist_ok=True)
+      lock = stack.enter_context(path.with_suffix('.lock').open('w'))
+      # A job that needs the same stakes waits here until another has them.
+      fcntl.flock(lock, fcntl.LOCK_EX)
+    return _kept(path, key) or _measured(world, design, path)
+
+
+def _kept(path: pathlib.Path, key: str) -> stakes.Stakes | None:
+  """Returns the stakes in a file, or `None` if it has none of this key."""
+  if not path.exists():
+    return None
+  content = storage.read_json(path)
+  kept = validation.validate(stakes.Stakes, content, str(path))
+  return kept if kept.key == key else None
+
+
+def _measured(
+    world: worlds.World, design: specs.DesignSpec, path: pathlib.Path
+) -> stakes.Stakes | None:
+  """Measures stakes, and writes them into a file."""
   found = worlds.stakes_of(world, design)
   if found is not None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    # Jobs that start together measure the same stakes at the same time.
-    partial = path.with_suffix(f'.{os.getpid()}')
-    storage.write_json(partial, found.model_dump())
-    with storage.explained(path):
-      os.replace(partial, path)
+    storage.write_json(path, found.model_dump())
   return found

@@ -63,8 +63,9 @@ def find_place(
     return arenas.Place((x, y), place.yaw, place.spread, height)
   if place not in named_places:
     raise errors.SpecError(
-        f'registers.{name}.place: this world has no place {place!r}; allowed'
-        f' are {sorted(named_places) or "coordinates"}'
+        f'registers.{name}.place: this world has no place {place!r}'
+        f'{messages.did_you_mean(place, named_places)}; allowed are'
+        f' {sorted(named_places) or "coordinates"}'
     )
   return named_places[place]
 

@@ -51,6 +51,7 @@ def check(design: Any, written_by_providers: Sequence[str]) -> None:
       _expect_actions(design, where, name)
   _refuse_second_writers(design)
   _refuse_parts(design)
+  _refuse_unwritten(design)
   _refuse_cycles(design)
   _check_learner(design)
 
@@ -124,6 +125,28 @@ def _refuse_parts(design: Any) -> None:
         )
 
 
+def _refuse_unwritten(design: Any) -> None:
+  """Refuses registers that agents read and that would stay as they are.
+
+  A stated `initial` is a value to keep: that of a constant, or of a register
+  which agents use as a memory.
+  """
+  written = {name for one in design.providers for name in one.writes}
+  for register, names in design.ports_by_register.items():
+    spec = design.registers[register]
+    if (
+        spec.role in _READ_BY_AGENTS
+        and written.isdisjoint(names)
+        and 'initial' not in spec.model_fields_set
+    ):
+      raise ValueError(
+          f'registers.{register}: no provider writes this {spec.role} register;'
+          ' allowed are an entry of providers that does, such as {kind:'
+          f' difference, reads: [score], writes: [{names[0]}]}}, and a stated'
+          ' initial, which the register keeps'
+      )
+
+
 def _refuse_second_writers(design: Any) -> None:
   """Refuses registers with two writers, whose values replace each other."""
   writers: dict[str, str] = {}
@@ -183,7 +206,7 @@ def _check_learner(design: Any) -> None:
     ValueError: If an option names a register that only providers may read, if
       the objective is invalid, reads a register that agents do not read, or
       queries a register that is no query register, or if there is none and the
-      kind is a misspelling of another one.
+      kind is a misspelling of another one, or if the kind of a defence is one.
   """
   extras = (design.learner.model_extra or {}) if design.learner else {}
   for field, value in extras.items():
@@ -195,6 +218,7 @@ def _check_learner(design: Any) -> None:
             f'{where}: an agent may not read {role} register {name!r} (feedback'
             ' providers only)'
         )
+  objectives.refuse_misspelt_defence(extras.get('defence'))
   objective, _ = objectives.of_learner(design.learner)
   if objective is None:
     if design.learner is not None:

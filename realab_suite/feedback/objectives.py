@@ -159,12 +159,13 @@ def why_unknown(defence: Any) -> str | None:
   if not isinstance(defence, Mapping):
     return None
   kind: Any = defence.get('kind')
-  if isinstance(kind, str) and (kind in PAYMENTS or kind in DEFENCES):
+  known = sorted({*PAYMENTS, *DEFENCES})
+  if isinstance(kind, str) and kind in known:
     return None
   return (
-      f'has the defence {messages.quote(kind)}, which is not registered; known'
-      f' are {sorted({*PAYMENTS, *DEFENCES})}, and --import names the module of'
-      ' another'
+      f'has the defence {messages.quote(kind)}, which is not registered'
+      f'{messages.did_you_mean(kind, known)}; known are {known}, and --import'
+      ' names the module of another'
   )
 
 
@@ -282,6 +283,22 @@ def refuse_misspelling(kind: str) -> None:
         f' {known}; a learner of your own that has such a name declares an'
         ' `objective`, or --import names its module'
     )
+
+
+def refuse_misspelt_defence(defence: Any) -> None:
+  """Refuses the kind of a defence that is almost a known one.
+
+  Args:
+    defence: Options of the defence, or `None`.
+
+  Raises:
+    ValueError: If its kind is unknown, and like a known one.
+  """
+  reason = why_unknown(defence)
+  if reason and messages.did_you_mean(
+      defence.get('kind'), {*PAYMENTS, *DEFENCES}, _MISSPELT
+  ):
+    raise ValueError(f'learner {reason}')
 
 
 def of_learner(learner: Any) -> tuple[ObjectiveSpec | None, str]:

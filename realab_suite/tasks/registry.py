@@ -6,6 +6,7 @@ this folder, and `--import` names those of other packages.
 
 from collections.abc import Callable, Mapping, Sequence
 import functools
+import inspect
 from typing import Any, Final, TypeVar
 
 from realab_suite import errors
@@ -139,6 +140,40 @@ def find(domain_name: str, task_name: str | None) -> TaskFactory:
       f'task {given} is unknown{messages.did_you_mean(given, known)}; known'
       f' are {", ".join(listed.values())}; a task of your own is known once its'
       ' module is imported (--import of programs)'
+  )
+
+
+def argument_names(factory: Callable[..., Any]) -> list[str]:
+  """Returns the names of the keyword arguments that a factory declares.
+
+  Args:
+    factory: A function, a class that may pass arguments on to its base classes,
+      or a partial function of one.
+  """
+  found = [inspect.signature(factory)]
+  made = factory.func if isinstance(factory, functools.partial) else factory
+  for base in inspect.getmro(made) if inspect.isclass(made) else ():
+    if '__init__' in vars(base) and _passes_on(found[-1]):
+      found.append(inspect.signature(base.__init__))
+  # Subclasses give those of base classes that have positions.
+  kinds = [
+      (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY),
+      *[(inspect.Parameter.KEYWORD_ONLY,)] * len(found),
+  ]
+  return list(
+      dict.fromkeys(
+          name
+          for signature, allowed in zip(found, kinds, strict=False)
+          for name, parameter in signature.parameters.items()
+          if parameter.kind in allowed
+      )
+  )
+
+
+def _passes_on(signature: inspect.Signature) -> bool:
+  return any(
+      parameter.kind == inspect.Parameter.VAR_KEYWORD
+      for parameter in signature.parameters.values()
   )
 
 

@@ -21,6 +21,8 @@ _VARIETIES = (
     ('secure', 'free', 0.7),
     ('welded', 'free', 0.7),
 )
+# Default of registers, in m or rad per unit.
+_SCALE = 0.1
 # Largest rounding error of a reading, in units, and of a position, in m.
 _ROUNDING = 1e-9
 _NUM_VALUES = 9
@@ -33,6 +35,9 @@ _NUM_WORLDS = 3
 # Distance by which a block is displaced in a test, and the least distance that
 # has to be reported for it, in m.
 _MOVED, _LEAST = 0.05, 0.025
+# Widths of ranges, in m or rad. An angle that is read from a rotation is known up
+# to a turn, of 6.28 rad, so some values of each range are read as others.
+_WIDE = (6.2, 7.0)
 _DIRECTIONS = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
 
 
@@ -51,6 +56,8 @@ def check_register(
     changes.
   - Its readings have the shape and dtype of its values. A look at a register
     changes nothing, and later writes change no earlier reading.
+  - A range of 6.2 or 7 m or rad is either stored as well, or refused by a
+    `SpecError` when the register is made.
   - If it is read from a distance, nothing is in the way in an empty world.
   - Undisturbed blocks keep each value, so they are clear of each other.
   - A write removes temporary corruption, and keeps permanent corruption.
@@ -93,6 +100,8 @@ def check_register(
         f'{subject.where}: a reset does not restore everything',
     )
   _check_batch(world)
+  for width in _WIDE:
+    _check_wide_range(kind, options, width)
 
 
 @final
@@ -103,7 +112,7 @@ class _World:
       self, kind: type[registers.Register], options: dict[str, Any]
   ) -> None:
     low, high = options['value_range']
-    spacing = 2.0 + 2 * (high - low) * options.get('scale', 0.1)
+    spacing = 2.0 + 2 * (high - low) * options.get('scale', _SCALE)
     arena = arenas.OpenRoom(half_width=spacing)
     self.registers = []
     for i, (channel, dof, yaw) in enumerate(_VARIETIES):
@@ -226,6 +235,33 @@ def _check_values(subject: _Subject) -> None:
       np.array_equal(snapshots.get_state(subject.physics), before),
       f'{where}: a refused value changes the world',
   )
+
+
+def _check_wide_range(
+    kind: type[registers.Register], options: dict[str, Any], width: float
+) -> None:
+  """Checks that a register stores each value of a wide range, or refuses it.
+
+  Args:
+    kind: Class of the register.
+    options: Arguments of the class.
+    width: Width of the range, in m or rad.
+  """
+  low, high = options['value_range']
+  high = max(high, low + width / options.get('scale', _SCALE))
+  try:
+    world = _World(kind, {**options, 'value_range': (low, high)})
+  except errors.SpecError:
+    return
+  [register, *_] = world.registers
+  try:
+    _check_values(_Subject(register, world, _where(register)))
+  except contracts.ContractError as error:
+    raise contracts.ContractError(
+        f'{error}; the range was [{low:g}, {high:g}]. A range with values that'
+        ' the blocks cannot tell apart, such as angles of more than a turn, has'
+        ' to be refused by a SpecError when the register is made'
+    ) from error
 
 
 def _check_looks(subject: _Subject) -> None:

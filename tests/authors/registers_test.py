@@ -269,3 +269,39 @@ def test_positions_are_relative_to_the_start():
   broken: Any = type('Broken', (_Counting,), {'_read_blocks': reads_anywhere})
   with pytest.raises(testing.ContractError, match='is read as'):
     testing.check_register(broken)
+
+
+class _Turning(_Counting):
+  """Turns its block, and takes every range."""
+
+  _least = -np.pi
+
+  def _places(self, physics, value):
+    return [np.array(self._origin(physics))]
+
+  def _put(self, physics, value, where=None):
+    [place] = self._places(physics, value)
+    self._blocks[0].put(physics, place, value * self._scale, where)
+
+  def _read_blocks(self, physics):
+    turned = self._blocks[0].heading(physics) - self._least
+    return ((turned + 1e-12) % (2 * np.pi) + self._least - 1e-12) / self._scale
+
+  def footprint(self, physics):
+    [place] = self._places(physics, np.array(0.0))
+    headings = self._low * self._scale, self._high * self._scale
+    return [registers.Path(0, place, place, self.value_range, headings)]
+
+  def displacements(self, physics):
+    wrong = self._read_blocks(physics) - self.applied(physics)
+    sides = np.abs(wrong) * self._scale * self._blocks[0].half_size
+    moved = super().displacements(physics)
+    return np.maximum(moved, sides[..., np.newaxis])
+
+
+@pytest.mark.parametrize('least', [-np.pi, -np.pi / 2, -0.3])
+def test_a_kind_that_wraps_outside_the_tried_range_is_noticed(least):
+  wrapping: Any = type('Wrapping', (_Turning,), {'_least': least})
+  with pytest.raises(testing.ContractError, match='is read as') as raised:
+    testing.check_register(wrapping)
+  assert 'angles of more than a turn' in str(raised.value)

@@ -1,11 +1,13 @@
 """Tests of runs: results, resuming after a kill, and errors."""
 
+from concurrent import futures
 import errno
 import functools
 import json
 import os
 import pathlib
 import shutil
+import threading
 
 import numpy as np
 import pytest
@@ -20,6 +22,7 @@ from realab_suite.experiments import kept_stakes
 from realab_suite.experiments import machines
 from realab_suite.experiments import storage
 from realab_suite.experiments import training
+from tests import patience
 from tests.experiments import fake_learner
 
 _ROOT = pathlib.Path(__file__).parents[2]
@@ -162,9 +165,33 @@ def test_rows_have_the_stakes_of_the_design_which_are_measured_once(
         keys.add(row.stake.key)
   # Once with the design, for both baselines, and once in the secure twin.
   assert len(measured) == 2
-  files = list((tmp_path / kept_stakes.FOLDER).iterdir())
+  files = list((tmp_path / kept_stakes.FOLDER).glob('*.json'))
   assert {file.stem for file in files} == keys
   assert len(keys) == 2
+
+
+def test_jobs_at_the_same_time_measure_stakes_once(tmp_path, monkeypatch):
+  job = _job()
+  found = worlds.stakes_of(job.experiment.world, job.design)
+  entered, released = threading.Semaphore(0), threading.Event()
+
+  def measure(*unused):
+    entered.release()
+    assert released.wait(patience.SECONDS)
+    return found
+
+  monkeypatch.setattr(worlds, 'key_of_stakes', lambda *unused: found.key)
+  monkeypatch.setattr(worlds, 'stakes_of', measure)
+  with futures.ThreadPoolExecutor() as pool:
+    asked = [
+        pool.submit(kept_stakes.stakes_of, None, None, tmp_path)
+        for _ in range(2)
+    ]
+    assert entered.acquire(timeout=patience.SECONDS)
+    is_measured_twice = entered.acquire(timeout=0.2)
+    released.set()
+    assert [one.result() for one in asked] == [found, found]
+  assert not is_measured_twice
 
 
 @pytest.mark.parametrize(
