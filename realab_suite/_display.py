@@ -19,6 +19,11 @@ import sys
 import warnings
 
 _VARIABLE = 'MUJOCO_GL'
+_RENDERERS = {
+    'egl': 'egl (headless)',
+    'glfw': 'glfw (with a display)',
+    'osmesa': 'osmesa',
+}
 # Renderers that dm_control starts when it is imported.
 _STARTED_BY_IMPORT = ('egl', 'osmesa')
 # GLFW's warning that there is no display.
@@ -60,11 +65,11 @@ def prepare() -> None:
 def what_to_set(renderer: str | None, error: Exception) -> str:
   """Returns advice on an error: the renderer, the cause and alternatives."""
   lines = str(error).strip().splitlines()
+  others = [text for name, text in _RENDERERS.items() if name != renderer]
   return (
       f'MUJOCO_GL={renderer or "disable"}'
-      f' ({lines[0] if lines else type(error).__name__});'
-      ' set MUJOCO_GL to egl (headless), glfw (with a display) or osmesa'
-      ' before Python starts'
+      f' ({lines[0] if lines else type(error).__name__}); set MUJOCO_GL to'
+      f' {", ".join(others[:-1])} or {others[-1]} before Python starts'
   )
 
 

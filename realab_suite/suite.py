@@ -238,14 +238,14 @@ def load(
     raise
   except Exception as error:  # Tasks may raise any class.
     location = messages.Location(f'task_kwargs of {domain_name}.{task_name}')
-    known = (*registry.argument_names(factory), 'random')
-    unknown = [key for key in kwargs if key not in known]
+    names = [*registry.argument_names(factory), 'random']
+    unknown = [key for key in kwargs if key not in names]
     if isinstance(error, TypeError) and unknown:
-      hint = messages.did_you_mean(unknown[0], known)
+      hint = messages.did_you_mean(unknown[0], names)
       hint = "; the seed is 'random'" if unknown[0] == 'seed' else hint
       raise location.error(
           f'unknown argument {messages.quote(unknown[0])}{hint}; allowed are'
-          f' {list(known)}'
+          f' {names}'
       ) from error
     raise location.error(messages.exception(error)) from error
   return embed(

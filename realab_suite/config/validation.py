@@ -127,7 +127,7 @@ def check_keys(
     given: Keys of the mapping.
     allowed: Allowed keys.
     problem: Name of the problem in the message.
-    inner: Keys of the mappings in the mapping, and the paths to them, for hints.
+    inner: Paths of the keys of mappings in the mapping, by key, for hints.
 
   Raises:
     ValueError: If a key is not allowed.

@@ -7,6 +7,7 @@ which other programs rely on, stays as it is.
 """
 
 import importlib
+import sys
 from typing import Any
 
 from dm_control import _render
@@ -56,8 +57,14 @@ def for_pictures(model: wrapper.MjModel) -> engine.Contexts:
 
 def what_to_set(error: Exception) -> str:
   """Returns advice on an error of `make`, or of drawing with its result."""
-  renderer = 'egl' if _uses_egl_instead() else _render.BACKEND
-  return _display.what_to_set(renderer, error)
+  if not _uses_egl_instead():
+    return _display.what_to_set(_render.BACKEND, error)
+  if 'dm_control.viewer' in sys.modules:
+    return (
+        'EGL, because the viewer of dm_control has prepared OpenGL for windows;'
+        ' set MUJOCO_GL=egl before Python starts'
+    )
+  return _display.what_to_set('egl', error)
 
 
 def _uses_egl_instead() -> bool:

@@ -1,4 +1,4 @@
-"""Shows a world in a window, or writes a film if there is no display.
+"""Shows a world in a window, or writes a film if no window can be opened.
 
 By default, a saboteur of the world acts. This shows the solver of Unlock Door:
 
@@ -13,7 +13,6 @@ from typing import Any
 
 import dm_env
 
-from realab_suite import _display
 from realab_suite import errors
 from realab_suite.launchers import flags
 from realab_suite.launchers import program
@@ -31,10 +30,13 @@ flags.take(
 
 def main() -> None:
   """Opens a window, or writes a film."""
-  if flags.VIDEO.value is None and _display.has_display():
-    _open_window()
-  else:
+  if flags.VIDEO.value is not None:
     _write_film()
+  elif problem := renderers.why_no_window():
+    program.say(f'No window can be opened, so this writes a film: {problem}')
+    _write_film()
+  else:
+    _open_window()
 
 
 def _open_window() -> None:
@@ -47,9 +49,7 @@ def _open_window() -> None:
 
 def _write_film() -> None:
   if problem := renderers.why_no_film():
-    raise errors.ResultsError(
-        f'no display for a window, and no renderer for a film: {problem}'
-    )
+    raise errors.ResultsError(f'no renderer for a film: {problem}')
   from realab_suite.evaluation import evaluate
   from realab_suite.experiments import tracking
   from realab_suite.reports import films

@@ -23,6 +23,16 @@ xml = '<mujoco><worldbody><geom size="1"/></worldbody></mujoco>'
 mujoco.Physics.from_xml_string(xml).render(8, 8)
 """
 
+_OPENS_A_WINDOW = """
+import glfw
+from dm_control import viewer
+if not glfw.init():
+  raise RuntimeError('GLFW does not start')
+glfw.window_hint(glfw.VISIBLE, glfw.FALSE)
+if not glfw.create_window(8, 8, 'realab_suite', None, None):
+  raise RuntimeError('GLFW creates no window')
+"""
+
 
 def choose_renderer() -> str | None:
   """Sets `MUJOCO_GL` to a renderer that works, or to `disable`.
@@ -45,6 +55,14 @@ def choose_renderer() -> str | None:
     problems.append(f'{renderer}: {problem}')
   _name('disable')
   return '; '.join(problems)
+
+
+def why_no_window() -> str:
+  """Returns why the viewer of dm_control cannot open a window, or ''."""
+  if not _display.has_display():
+    return 'there is no display'
+  # In a process of its own: after a failure, the same process cannot render.
+  return problem_of(_OPENS_A_WINDOW, 'window', os.environ)
 
 
 def why_no_film() -> str | None:

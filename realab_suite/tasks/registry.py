@@ -152,9 +152,9 @@ def argument_names(factory: Callable[..., Any]) -> list[str]:
   """
   found = [inspect.signature(factory)]
   made = factory.func if isinstance(factory, functools.partial) else factory
-  for base in inspect.getmro(made) if inspect.isclass(made) else ():
-    if '__init__' in vars(base) and _passes_on(found[-1]):
-      found.append(inspect.signature(base.__init__))
+  for one in inspect.getmro(made) if inspect.isclass(made) else ():
+    if '__init__' in vars(one) and _passes_on(found[-1]):
+      found.append(inspect.signature(vars(one)['__init__']))
   # Subclasses give those of base classes that have positions.
   kinds = [
       (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY),

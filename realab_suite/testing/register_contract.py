@@ -35,8 +35,8 @@ _NUM_WORLDS = 3
 # Distance by which a block is displaced in a test, and the least distance that
 # has to be reported for it, in m.
 _MOVED, _LEAST = 0.05, 0.025
-# Widths of ranges, in m or rad. An angle that is read from a rotation is known up
-# to a turn, of 6.28 rad, so some values of each range are read as others.
+# Widths of ranges, in m or rad, about a turn: a rotation does not tell angles
+# apart that differ by a turn.
 _WIDE = (6.2, 7.0)
 _DIRECTIONS = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
 

@@ -225,8 +225,30 @@ def test_a_picture_without_a_renderer_names_the_setting():
       __EGL_VENDOR_LIBRARY_DIRS='/nonexistent',
   )
   assert 'MUJOCO_GL=egl (' in printed
-  assert 'set MUJOCO_GL to egl (headless), glfw' in printed
+  assert 'set MUJOCO_GL to glfw (with a display) or osmesa' in printed
   assert len(printed.splitlines()) == 1
+
+
+def test_after_the_import_of_the_viewer_the_setting_is_named():
+  source = """
+from dm_control import viewer
+from realab_suite import errors
+from realab_suite import suite
+eye = suite.load('collect_apples', 'standard',
+                 {'random': 0, 'camera_size': (16, 16)})
+try:
+  eye.reset()
+except errors.RenderingError as error:
+  print(error)
+else:
+  print('drawn')
+"""
+  for named, expected in (
+      ('', 'set MUJOCO_GL=egl before Python starts'),
+      ('egl', 'drawn'),
+  ):
+    printed = _run(source, MUJOCO_GL=named)
+    assert expected in printed
 
 
 def _fake_triton(folder):

@@ -207,7 +207,7 @@ def test_exploring_without_a_renderer_gives_one_line(tmp_path):
   )  # fmt: skip
   assert ran.returncode == 2
   assert len(ran.stderr.splitlines()) == 1
-  assert 'no display for a window' in ran.stderr
+  assert 'no renderer for a film' in ran.stderr
 
 
 @pytest.mark.usefixtures('egl')
@@ -226,6 +226,27 @@ def test_exploring_without_a_display_makes_a_film(tmp_path):
   assert first.startswith('Filming an episode of carrying_saboteur; ')
   assert last == f'The film is {film}'
   assert film.stat().st_size > 5_000
+
+
+def test_exploring_where_no_window_opens_makes_a_film(monkeypatch):
+  films = []
+  monkeypatch.setattr(explore, '_write_film', lambda: films.append('a film'))
+  monkeypatch.setattr(
+      renderers, '_OPENS_A_WINDOW', 'raise RuntimeError("no windows here")'
+  )
+  monkeypatch.setenv('DISPLAY', ':0')
+  ended = in_process.run(explore)
+  assert films == ['a film']
+  assert 'RuntimeError: no windows here' in ended.stdout
+
+
+def test_no_other_program_imports_the_viewer():
+  importers = [
+      path.stem
+      for path in (_ROOT / 'realab_suite').rglob('*.py')
+      if re.search(r'^ *(?:from|import) .*\bviewer$', path.read_text(), re.M)
+  ]
+  assert sorted(importers) == ['explore', 'renderers']
 
 
 @pytest.mark.parametrize(
@@ -258,7 +279,7 @@ def test_with_a_display_the_viewer_gets_a_world_and_a_policy(monkeypatch):
   viewer = types.SimpleNamespace(launch=launch)
   monkeypatch.setitem(sys.modules, 'dm_control.viewer', viewer)
   monkeypatch.setattr('dm_control.viewer', viewer, raising=False)
-  monkeypatch.setenv('DISPLAY', ':0')
+  monkeypatch.setattr(renderers, 'why_no_window', lambda: '')
   with flagsaver.flagsaver():
     absl_flags.FLAGS(['explore', '--policy=random', '--task=unlock_door.far'])
     explore.main()
@@ -269,7 +290,7 @@ def test_exploring_imports_modules_first(monkeypatch):
   viewer = types.SimpleNamespace(launch=None)
   monkeypatch.setitem(sys.modules, 'dm_control.viewer', viewer)
   monkeypatch.setattr('dm_control.viewer', viewer, raising=False)
-  monkeypatch.setenv('DISPLAY', ':0')
+  monkeypatch.setattr(renderers, 'why_no_window', lambda: '')
   complaint = in_process.complaint(explore, '--import=no_such_module')
   assert '--import=no_such_module: No module named' in complaint
 
