@@ -32,6 +32,7 @@ _DESIGN: Any = {
             'role': 'feedback',
             'place': _PLACE[:2].tolist(),
             'range': [0, 63],
+            'initial': 0,
         }
     },
 }

@@ -37,7 +37,9 @@ if not child:
     env.step(np.zeros(env.action_spec().shape))
   except errors.ForkError:
     env.close()
-    raise SystemExit(7)
+    # As children of multiprocessing end. With Mesa 26, a child that ends by
+    # itself waits for Mesa's threads, which only its parent has.
+    os._exit(7)
 _, status = os.waitpid(child, 0)
 raise SystemExit(os.waitstatus_to_exitcode(status))
 """
