@@ -318,3 +318,60 @@ def test_the_package_has_the_functions_of_a_first_use(name: str):
 def test_a_misspelt_function_is_named_beside_the_others():
   with pytest.raises(AttributeError, match=r"'lod'; it has .*'load'"):
     realab_suite.lod  # noqa: B018
+
+
+@pytest.mark.parametrize(
+    ('options', 'complaint'),
+    [
+        (
+            {'task_kwargs': {'randm': 1}},
+            "task_kwargs of unlock_door.near: unknown argument 'randm'; did you"
+            " mean 'random'?; allowed are ['camera_size',"
+            " 'starts_beside_registers', 'physics_timestep', 'random']",
+        ),
+        (
+            {'task_kwargs': {'seed': 1}},
+            "unknown argument 'seed'; the seed is 'random'; allowed are [",
+        ),
+        (
+            {'environment_kwargs': {'sense': ['camera']}},
+            "environment_kwargs: unknown ['sense']; did you mean 'senses'?",
+        ),
+        (
+            {'environment_kwargs': {'senses': ['camra']}},
+            "senses: unknown ['camra']; did you mean 'camera'?; this world",
+        ),
+        (
+            {'overrides': ['reward.scale=1']},
+            "unknown key 'reward'; did you mean 'registers.reward'?",
+        ),
+        (
+            {'overrides': ['registers.reward.range=[1]']},
+            'registers.reward.range: must have at least 2 items, got [1]',
+        ),
+        (
+            {'overrides': ['registers.reward.range=3']},
+            'registers.reward.range: must be a list, got 3',
+        ),
+        (
+            {'overrides': ['channel=secur']},
+            "'secure', got 'secur'; did you mean 'secure'?",
+        ),
+        (
+            {'overrides': ['schedule=cfmp']},
+            "got 'cfmp'; did you mean 'cfmdp'?",
+        ),
+        (
+            {'overrides': ['registers.reward.place=station_9']},
+            "no place 'station_9'; did you mean 'station_",
+        ),
+        (
+            {'overrides': ['learner.defence={kind: capp}']},
+            "the defence 'capp', which is not registered; did you mean 'cap'?",
+        ),
+    ],
+)
+def test_what_is_misspelt_is_named_with_what_is_like_it(options, complaint):
+  with pytest.raises(errors.SpecError) as raised:
+    suite.load('unlock_door', 'near', design='instantaneous_reward', **options)
+  assert complaint in str(raised.value)

@@ -100,7 +100,7 @@ def two_blocks(role: str, place: Any = 'station_1', **fields: Any) -> Any:
   """Returns the spec of a register as a mapping."""
   return {
       'kind': 'two_block', 'role': role, 'place': place, 'range': [-2, 12],
-      **fields,
+      'initial': 0, **fields,
   }  # fmt: skip
 
 

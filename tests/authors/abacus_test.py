@@ -412,6 +412,7 @@ def _kind(name, base, shape_of):
           'one': {
               'kind': name,
               'role': 'feedback',
+              'initial': 0,
               'place': 'station_1',
               'range': [0, 5],
           }

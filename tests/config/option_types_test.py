@@ -109,7 +109,7 @@ def _typed() -> Iterator[None]:
     ('pushing_saboteur', {'target': [1, 2, 3]},
         '.target: must have at most 2 items'),
     ('pushing_saboteur', {'target': [1]},
-        '.target[1]: required key is missing'),
+        '.target: must have at least 2 items, got [1]'),
     ('test_typed', {'flag': False}, '.needed: required key is missing'),
     ('test_typed', {'needed': 1, 'mapping': {'a': 'x'}},
         ".mapping.a: must be a valid integer, got 'x'"),

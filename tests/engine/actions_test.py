@@ -19,6 +19,7 @@ from tests.engine import helpers
 _NUM_ACTIONS = 200
 # Every so many of them are taken as steps.
 _STRIDE = 5
+_CONSTANT = 'registers.advice.initial=0'
 # By name: a design, its overrides, and the type and the shape of actions.
 # Besides the designs that ship: a query that cannot be an index, and queries
 # beside the elements of continuous control.
@@ -28,10 +29,12 @@ _CASES: dict[str, tuple[str, tuple[str, ...], Any, tuple[int, ...]]] = {
     'a query': ('value_advice', (), np.int32, (2,)),
     'two queries': ('paired_decoupled_approval', (), np.int32, (3,)),
     'real query': (
-        'value_advice', ('providers=[]', 'learner=null'), np.float64, (2,),
+        'value_advice', (_CONSTANT, 'providers=[]', 'learner=null'),
+        np.float64, (2,),
     ),
     'continuous, with queries': (
-        'value_advice', ('providers=[]', 'learner=null', 'action_set=null'),
+        'value_advice',
+        (_CONSTANT, 'providers=[]', 'learner=null', 'action_set=null'),
         np.float64, (7,),
     ),
     'real and integer queries': (

@@ -233,7 +233,9 @@ def test_a_batch_is_refused_with_the_remedy():
 def test_a_start_inside_a_register_is_drawn_again_and_at_last_refused():
   design = embedded.control_design('point_mass')
   # All over the places where the mass begins.
-  design['registers']['reward'] |= {'place': [0, 0, 0], 'block_size': 1.0}
+  design['registers']['reward'] |= {
+      'place': [0, 0, 0], 'block_size': 1.0, 'initial': 0,
+  }  # fmt: skip
   del design['registers']['score']
   design |= {'meters': [], 'providers': []}
   env = suite.load(

@@ -29,7 +29,7 @@ class _Furnished(collect_apples.CollectApples):
 def _design(place: Any = 'table', **register: Any) -> dict[str, Any]:
   register = {
       'kind': 'block_position', 'range': [0, 1], 'scale': 0.1,
-      'role': 'feedback', 'place': place, **register,
+      'role': 'feedback', 'initial': 0, 'place': place, **register,
   }  # fmt: skip
   return {'schema': 1, 'name': 'high', 'registers': {'r': register}}
 

@@ -46,7 +46,14 @@ def one_register(
   return {
       'schema': 1,
       'name': 'one_register',
-      'registers': {name: {'kind': 'two_block', 'place': place, **register}},
+      'registers': {
+          name: {
+              'kind': 'two_block',
+              'place': place,
+              'initial': 0,
+              **register,
+          }
+      },
       'providers': list(providers),
   }
 

@@ -21,7 +21,12 @@ _DESIGNS = {
     'queries and an index': ('paired_decoupled_approval', ()),
     'queries and a vector': (
         'value_advice',
-        ('action_set=null', 'providers=[]', 'learner=null'),
+        (
+            'action_set=null',
+            'registers.advice.initial=0',
+            'providers=[]',
+            'learner=null',
+        ),
     ),
 }
 

@@ -38,6 +38,7 @@ def _design(dof: str) -> dict[str, Any]:
           name: {
               'kind': kind,
               'role': 'feedback',
+              'initial': 0,
               'place': [_START[0], _START[1] - i],
               'range': [-2, 12],
           }
@@ -152,6 +153,7 @@ def test_round_things_beside_a_register_do_not_obstruct_it(geom, turned):
   reward = {
       'kind': 'block_position',
       'role': 'feedback',
+      'initial': 0,
       'place': {'position': start.tolist(), 'yaw': turned},
       'range': [0, 10],
   }
@@ -171,6 +173,7 @@ def test_an_obstructed_block_leaves_the_wall_slowly(size):
   reward = {
       'kind': 'block_position',
       'role': 'feedback',
+      'initial': 0,
       'place': [-2.3, -2.6],
       'range': [0, 35],
       'block_size': size,
@@ -205,6 +208,7 @@ _DIAGONAL = {
         'reward': {
             'kind': 'block_position',
             'role': 'feedback',
+            'initial': 0,
             'place': {'position': [-3.0, -3.0], 'yaw': np.pi / 4},
             'range': [0, 80],
         }

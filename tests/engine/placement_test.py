@@ -22,7 +22,7 @@ _WORLD = 'collect_apples', 'standard'
 
 def _register(place, **options):
   options = {'kind': 'block_position', 'range': [-1, 1], **options}
-  return {'role': 'feedback', 'place': place, **options}
+  return {'role': 'feedback', 'initial': 0, 'place': place, **options}
 
 
 def _design(place, **register):
@@ -172,7 +172,12 @@ def test_accepted_rooms_have_no_overlap(room):
 
 def test_rejected_rooms_have_an_overlap(monkeypatch):
   # Found at random: a barrier, a yawed wall, a post, a door, two registers.
-  wide = {'kind': 'block_position', 'role': 'feedback', 'range': [0.0, 1.0]}
+  wide = {
+      'kind': 'block_position',
+      'role': 'feedback',
+      'initial': 0,
+      'range': [0.0, 1.0],
+  }
   turning = {**wide, 'kind': 'block_orientation', 'scale': 1.5}
   region = {'position': [0.0, 2.0], 'spread': [0.6, 0.4], 'yaw': 0.3}
   box = obstacles.Obstacle('box', (0.4, 0.05, 0.3), (0.9, 2.3), 0.8, None)

@@ -168,7 +168,12 @@ def _in_the_way(**others: Any) -> dict[str, Any]:
       'schema': 1,
       'name': 'in_the_way',
       'registers': {
-          'reward': {**block, 'role': 'feedback', 'place': [1.5, -0.1]},
+          'reward': {
+              **block,
+              'role': 'feedback',
+              'initial': 0,
+              'place': [1.5, -0.1],
+          },
           'other': {**block, 'role': 'meter', 'place': [-0.8, 2.0], **others},
       },
   }
@@ -188,7 +193,7 @@ _ASKED = {
     ],
 }
 _SELDOM = {
-    **_in_the_way(role='signal', ends_episode={'above': 9.0}),
+    **_in_the_way(role='signal', initial=0, ends_episode={'above': 9.0}),
     'schedule': 'cfmdp',
     'providers': [
         {'kind': 'constant', 'value': 3.0, 'writes': ['reward'], 'every': 7},

@@ -10,7 +10,7 @@ from realab_suite.engine import solids
 from tests.engine import helpers
 
 _REGISTER = {
-    'kind': 'two_block', 'role': 'feedback', 'place': [0.0, 0.0],
+    'kind': 'two_block', 'role': 'feedback', 'initial': 0, 'place': [0.0, 0.0],
     'range': [-2, 4],
 }  # fmt: skip
 # Middle and half size of a wall.

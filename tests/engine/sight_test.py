@@ -21,7 +21,9 @@ from realab_suite.tasks import collect_apples
 from tests.engine import helpers
 
 _SCENERY = {'contype': 0, 'conaffinity': 0}
-_BLOCK = {'kind': 'block_position', 'block_size': 0.5, 'scale': 0.05}
+_BLOCK = {
+    'kind': 'block_position', 'block_size': 0.5, 'scale': 0.05, 'initial': 0,
+}  # fmt: skip
 _HIGH, _LOW = (0.44, 1.5, 1.8), (0.44, 1.5, 0.4)
 
 
@@ -53,7 +55,7 @@ class _Room(collect_apples.CollectApples):
 
 def _display(point: Any = _HIGH, **more: Any) -> dict[str, Any]:
   return {
-      'kind': 'display', 'role': 'feedback', 'place': [0.0, 2.0],
+      'kind': 'display', 'role': 'feedback', 'initial': 0, 'place': [0.0, 2.0],
       'range': [0, 7], 'options': {'tiles': 3, 'reading_point': [*point]},
       **more,
   }  # fmt: skip

@@ -43,7 +43,7 @@ class _Maze(collect_apples.CollectApples):
 def _design(**register: Any) -> dict[str, Any]:
   register = {
       'kind': 'two_block', 'role': 'feedback', 'place': [0.0, 2.0],
-      'range': [0, 10], **register,
+      'range': [0, 10], 'initial': 0, **register,
   }  # fmt: skip
   return {'schema': 1, 'name': 'd', 'registers': {'r': register}}
 

@@ -391,7 +391,7 @@ def _five_near():
       'name': 'five',
       'registers': {
           name: {
-              'kind': kind, 'role': 'feedback', 'place': place,
+              'kind': kind, 'role': 'feedback', 'initial': 0, 'place': place,
               'range': [0, 3],
           }
           for name, (kind, place) in kinds.items()

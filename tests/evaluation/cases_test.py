@@ -191,7 +191,7 @@ def test_a_base_block_that_moved_by_a_few_centimetres_once_tampers(then):
 
 _END = 20
 _SWITCH = {
-    'kind': 'two_block', 'role': 'signal', 'place': [-2.9, -0.5],
+    'kind': 'two_block', 'role': 'signal', 'initial': 0, 'place': [-2.9, -0.5],
     'range': [0, 1], 'scale': 1.0, 'ends_episode': {'above': 0.5},
 }  # fmt: skip
 _SECURE = ('registers.reward.channel=secure', 'registers.score.channel=secure')

@@ -147,6 +147,7 @@ def _design(**options):
           'reward': {
               'kind': 'display',
               'role': 'feedback',
+              'initial': 0,
               'place': [0.5, -2.0],
               'range': [0, 7],
               'options': {'tiles': 3, **options},
@@ -154,6 +155,7 @@ def _design(**options):
           'copy': {
               'kind': 'two_block',
               'role': 'feedback',
+              'initial': 0,
               'place': [-2.5, -3.0],
               'range': [0, 7],
           },

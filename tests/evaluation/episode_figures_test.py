@@ -25,7 +25,7 @@ def _design(objective, ends=None, **changes):
   """Returns a design with a register of each role that is read and written."""
   made = {
       name: {'kind': 'two_block', 'role': role, 'place': [i, 0],
-             'range': [-100, 100], 'scale': _SCALES[name]}
+             'range': [-100, 100], 'scale': _SCALES[name], 'initial': 0}
       for i, (name, role) in enumerate(_ROLES.items())
   }  # fmt: skip
   if ends is not None:

@@ -192,7 +192,7 @@ def _with_stop(**learner):
           **designs.SCORED['registers'],
           'stop': {
               'kind': 'two_block', 'role': 'signal', 'place': 'station_3',
-              'range': [0, 1], 'ends_episode': {'above': 0.5},
+              'range': [0, 1], 'ends_episode': {'above': 0.5}, 'initial': 0,
           },
       },
       'learner': learner,
@@ -293,7 +293,12 @@ def test_what_a_learner_may_heed_unpaid_is_not_consumed():
       **designs.SCORED,
       'registers': {
           **designs.SCORED['registers'],
-          'bell': {**designs.REWARD, 'place': 'station_3', 'role': 'signal'},
+          'bell': {
+              **designs.REWARD,
+              'place': 'station_3',
+              'role': 'signal',
+              'initial': 0,
+          },
           'decoy': {**designs.REWARD, 'place': 'station_4'},
       },
   }

@@ -60,6 +60,7 @@ class Stage:
           'kind': 'block_position',
           'role': 'meter' if name == 'meter' else 'feedback',
           'range': [0, 1],
+          'initial': 0,
           'place': {
               'position': turned(position, angle).tolist(),
               'yaw': yaw + angle,

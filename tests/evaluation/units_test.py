@@ -35,7 +35,7 @@ def _design(name, factor):
   made = {
       register: {'kind': 'two_block', 'role': role, 'place': [i, 0],
                  'range': [-1000 * factor, 1000 * factor],
-                 'scale': 0.125 / factor}
+                 'scale': 0.125 / factor, 'initial': 0}
       for i, (register, role) in enumerate(_ROLES.items())
   }  # fmt: skip
   if name == 'switch':

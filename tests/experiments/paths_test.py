@@ -34,7 +34,7 @@ _ALLOWED = (
     sysconfig.get_path('stdlib'),
 )
 _REGISTER = {
-    'kind': 'two_block', 'role': 'feedback', 'place': 'station_1',
+    'kind': 'two_block', 'role': 'feedback', 'initial': 0, 'place': 'station_1',
     'range': [0, 13],
 }  # fmt: skip
 

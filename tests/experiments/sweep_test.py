@@ -390,7 +390,7 @@ def test_a_wrong_option_of_a_learner_is_refused_before_anything_is_trained(
   own['learner'] |= options
   own['overrides'] = [
       'registers.bell={kind: two_block, role: signal, place: station_4,'
-      ' range: [0, 1]}'
+      ' range: [0, 1], initial: 0}'
   ]
   one = {**_SMALL, 'runs': {'good': run, 'own': own}}
   (tmp_path / 'one.yaml').write_text(json.dumps(one))

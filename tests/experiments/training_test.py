@@ -1,13 +1,12 @@
 """Tests of runs: results, resuming after a kill, and errors."""
 
-from concurrent import futures
 import errno
+import fcntl
 import functools
 import json
 import os
 import pathlib
 import shutil
-import threading
 
 import numpy as np
 import pytest
@@ -22,7 +21,6 @@ from realab_suite.experiments import kept_stakes
 from realab_suite.experiments import machines
 from realab_suite.experiments import storage
 from realab_suite.experiments import training
-from tests import patience
 from tests.experiments import fake_learner
 
 _ROOT = pathlib.Path(__file__).parents[2]
@@ -170,28 +168,22 @@ def test_rows_have_the_stakes_of_the_design_which_are_measured_once(
   assert len(keys) == 2
 
 
-def test_jobs_at_the_same_time_measure_stakes_once(tmp_path, monkeypatch):
+def test_a_job_waits_for_stakes_that_another_one_measures(
+    tmp_path, monkeypatch
+):
   job = _job()
   found = worlds.stakes_of(job.experiment.world, job.design)
-  entered, released = threading.Semaphore(0), threading.Event()
+  path = tmp_path / kept_stakes.FOLDER / f'{found.key}.json'
 
-  def measure(*unused):
-    entered.release()
-    assert released.wait(patience.SECONDS)
-    return found
+  def wait(file, operation):
+    assert file.name == str(path.with_suffix('.lock'))
+    assert operation == fcntl.LOCK_EX
+    storage.write_json(path, found.model_dump())
 
   monkeypatch.setattr(worlds, 'key_of_stakes', lambda *unused: found.key)
-  monkeypatch.setattr(worlds, 'stakes_of', measure)
-  with futures.ThreadPoolExecutor() as pool:
-    asked = [
-        pool.submit(kept_stakes.stakes_of, None, None, tmp_path)
-        for _ in range(2)
-    ]
-    assert entered.acquire(timeout=patience.SECONDS)
-    is_measured_twice = entered.acquire(timeout=0.2)
-    released.set()
-    assert [one.result() for one in asked] == [found, found]
-  assert not is_measured_twice
+  monkeypatch.setattr(kept_stakes.fcntl, 'flock', wait)
+  # They would be measured in a world, which is missing here.
+  assert kept_stakes.stakes_of(None, None, tmp_path) == found
 
 
 @pytest.mark.parametrize(

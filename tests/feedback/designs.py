@@ -7,7 +7,7 @@ from realab_suite.config import loading
 
 REWARD: dict[str, Any] = {
     'kind': 'two_block', 'role': 'feedback', 'place': 'station_1',
-    'range': [-2, 12],
+    'range': [-2, 12], 'initial': 0,
 }  # fmt: skip
 SCORE = {**REWARD, 'role': 'meter', 'place': 'station_2', 'range': [0, 20]}
 QUERY = {**REWARD, 'role': 'query', 'place': 'station_2', 'range': [0, 13]}

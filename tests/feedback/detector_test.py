@@ -198,10 +198,10 @@ _MISFITS = {
         f"sight.eye: 'guard' {_CANNOT}'avatar'",
 }  # fmt: skip
 _WRONG = {
-    'of: []': 'of: must have at least 1 item after validation, not 0',
+    'of: []': 'of: must have at least 1 item, got []',
     'of: [reward], sight: {}': 'sight.eye: required key is missing',
     'of: [reward], sight: {eye: [1, 2]}':
-        'sight.eye[2]: required key is missing',
+        'sight.eye: must have at least 3 items, got [1, 2]',
     'of: [reward], sight: {eye: a, angle: 361}':
         'sight.angle: must be less than or equal to 360, got 361',
     'of: [reward], sight: {eye: a, range: 0}':

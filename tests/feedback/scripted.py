@@ -60,6 +60,7 @@ def register(role: str, place: str, low: float, high: float) -> dict[str, Any]:
       'role': role,
       'place': place,
       'range': [low, high],
+      'initial': 0,
   }
 
 

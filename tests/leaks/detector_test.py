@@ -14,7 +14,7 @@ from tests.leaks import secrets
 def _register(role: str, place: str, **more: Any) -> dict[str, Any]:
   return {
       'kind': 'two_block', 'role': role, 'place': place, 'range': [0, 8],
-      **more,
+      'initial': 0, **more,
   }  # fmt: skip
 
 
