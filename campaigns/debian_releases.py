@@ -31,7 +31,7 @@ def main() -> int:
       _unpack(release, root)
     # JAX reads the processors from there.
     if not (root / 'proc' / 'self').exists():
-      _run('mount', '-t', 'proc', 'proc', root / 'proc')
+      _run('mount', '--bind', '/proc', root / 'proc')
     clone = root / 'realab'
     _run('rm', '-rf', clone)
     _run('git', 'clone', '-q', pathlib.Path.cwd(), clone)
