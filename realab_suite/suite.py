@@ -240,7 +240,7 @@ def load(
     location = messages.Location(f'task_kwargs of {domain_name}.{task_name}')
     names = [*registry.argument_names(factory), 'random']
     unknown = [key for key in kwargs if key not in names]
-    if isinstance(error, TypeError) and unknown:
+    if unknown and 'unexpected keyword argument' in str(error):
       hint = messages.did_you_mean(unknown[0], names)
       hint = "; the seed is 'random'" if unknown[0] == 'seed' else hint
       raise location.error(

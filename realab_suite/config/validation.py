@@ -72,18 +72,28 @@ class Model(pydantic.BaseModel, abc.ABC):
   def _check_keys(cls, data: Any) -> Any:
     if isinstance(data, Mapping) and cls.model_config['extra'] == 'forbid':
       fields = cls.model_fields
-      check_keys(
-          [key for key in data if key not in fields],
-          [field.alias or name for name, field in fields.items()],
-          inner={
-              key: f'{name}.{key}'
-              for name, value in data.items()
-              if name in fields and isinstance(value, Mapping)
-              for key, one in value.items()
-              if isinstance(one, Mapping) == isinstance(data.get(key), Mapping)
-          },
-      )
+      unknown = [key for key in data if key not in fields]
+      if unknown:
+        allowed = [field.alias or name for name, field in fields.items()]
+        check_keys(unknown, allowed, inner=_inner_paths(data, unknown))
     return data
+
+
+def _inner_paths(
+    data: Mapping[str, Any], keys: Collection[str]
+) -> dict[str, str]:
+  """Returns the paths of keys that a mapping in the data has, for hints.
+
+  What they lead to is a mapping in both places, or in none.
+  """
+  return {
+      key: f'{name}.{key}'
+      for name, value in data.items()
+      if isinstance(value, Mapping)
+      for key in keys
+      if key in value
+      if isinstance(value[key], Mapping) == isinstance(data[key], Mapping)
+  }
 
 
 class Record(pydantic.BaseModel, abc.ABC):

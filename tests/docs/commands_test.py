@@ -2,6 +2,7 @@
 
 import ast
 import re
+import shlex
 import tempfile
 
 import pytest
@@ -61,8 +62,7 @@ def _definitions(page):
 def _script(piece, sockets):
   """Returns the script of a piece, with sockets in a folder of the test."""
   if piece.kind == 'python':
-    (text,) = [piece.text.replace("'", "'\\''")]
-    return f"python -c '{text}'"
+    return f'python -c {shlex.quote(piece.text)}'
   text = piece.text.replace('<this repository>', 'URL')
   text = text.replace('unix:/tmp/realab/', f'unix:{sockets}/')
   text = re.sub(r' \[[^\]=]*\]', '', text) if 'campaigns.' in text else text
