@@ -60,8 +60,8 @@ format: .venv/dev
 	$(PY) -m pyink -q .
 
 clean:
-	rm -rf .venv build dist compat/*/build *.egg-info .coverage .hypothesis .mypy_cache \
-		.pytest_cache .ruff_cache
+	rm -rf .venv build dist compat/*/build *.egg-info .coverage .hypothesis \
+		.mypy_cache .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Stamp files: packages are installed again only if a prerequisite changes.
