@@ -100,7 +100,7 @@ class Documents(Generic[_Spec]):
     """Returns the name of a source for messages, and its data."""
     what = self._what
     if isinstance(source, self._model):
-      data = source.to_mapping()
+      data = source.to_source()
       return f'{what} {data["name"]!r}', data
     if isinstance(source, Mapping):
       return what, loading.read_mapping(source)

@@ -114,6 +114,13 @@ class Spec(Model):
     """Returns the spec as plain data, including defaults."""
     return self.model_dump(mode='json', by_alias=True)
 
+  def to_source(self) -> dict[str, Any]:
+    """Returns plain data to change, which loads as this spec.
+
+    Specs whose checks depend on what is stated leave out defaults here.
+    """
+    return self.to_mapping()
+
   def digest(self) -> str:
     """Returns a hash of all fields, which identifies results."""
     return digest_of(self.to_mapping())

@@ -113,7 +113,7 @@ class RunSpec(validation.Spec):
     if not self.learner:
       return design
     own = {} if design.learner is None else design.learner.model_dump()
-    changed = {**design.to_mapping(), 'learner': {**own, **self.learner}}
+    changed = {**design.to_source(), 'learner': {**own, **self.learner}}
     # Problems from here on belong to the run and not to the file of the design.
     return validation.validate(
         specs.DesignSpec,

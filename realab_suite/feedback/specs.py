@@ -384,8 +384,19 @@ class DesignSpec(validation.Spec):
     if found == self.providers:
       return self
     return validation.validate(
-        DesignSpec, {**self.to_mapping(), 'providers': found}, where
+        DesignSpec, {**self.to_source(), 'providers': found}, where
     )
+
+  def to_source(self) -> dict[str, Any]:
+    """Returns the design without the `initial` that registers do not state.
+
+    A stated value may be kept by a register that no provider writes.
+    """
+    data = self.to_mapping()
+    for name, spec in self.registers.items():
+      if 'initial' not in spec.model_fields_set:
+        del data['registers'][name]['initial']
+    return data
 
   def channel_of(self, name: str) -> arguments.Channel:
     """Returns the channel of a register.

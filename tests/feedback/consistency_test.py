@@ -1,10 +1,13 @@
 """Tests that the parts of a design fit each other."""
 
+import json
+import pathlib
 from typing import Any, Literal, final
 
 import pytest
 
 from realab_suite import suite
+from realab_suite.experiments import experiment_specs
 from realab_suite.feedback import providers
 from realab_suite.feedback import specs
 from tests.config import refusals
@@ -183,6 +186,83 @@ _RIGHT = {
 @pytest.mark.parametrize('design', _RIGHT.values(), ids=_RIGHT)
 def test_parts_that_fit_are_accepted(design: Any):
   assert specs.load(design).to_mapping()['providers'] is not None
+
+
+_WRITER = {'kind': 'difference', 'reads': ['score'], 'writes': ['extra']}
+
+
+def _with_extra(**changes: Any) -> dict[str, Any]:
+  """Returns a design with a register `extra`, which has no writer."""
+  extra = {
+      'kind': 'two_block', 'role': 'feedback', 'place': 'station_3',
+      'range': [-2, 12], **changes,
+  }  # fmt: skip
+  found = {**designs.SCORED['registers'], 'extra': extra}
+  return {**designs.SCORED, 'registers': found}
+
+
+def _unwritten(role: str = 'feedback') -> str:
+  return (
+      f'registers.extra: no provider writes this {role} register; allowed are'
+      ' an entry of providers that does, such as {kind: difference, reads:'
+      ' [score], writes: [extra]}, and a stated initial, which the register'
+      ' keeps'
+  )
+
+
+@pytest.mark.parametrize('role', ['feedback', 'signal'])
+def test_a_register_for_agents_needs_a_writer_or_an_initial_value(role: str):
+  design = _with_extra(role=role)
+  text = refusals.refusal(specs.load, design)
+  assert text == f'design: {_unwritten(role)}'
+  specs.load({**design, 'providers': [*design['providers'], _WRITER]})
+  stated = specs.load(_with_extra(role=role, initial=0))
+  assert stated.registers['extra'].initial == 0
+  assert specs.load(design, ['registers.extra.initial=0']) == stated
+
+
+@pytest.mark.parametrize('role', ['meter', 'memory', 'query'])
+def test_other_registers_need_no_writer(role: str):
+  assert specs.load(_with_extra(role=role)).registers['extra'].role == role
+
+
+def test_stating_the_default_initial_value_keeps_the_digest():
+  plain = _with_extra(role='memory')
+  stated = _with_extra(role='memory', initial=0)
+  assert specs.load(plain).digest() == specs.load(stated).digest()
+
+
+def test_a_stored_design_can_be_loaded_and_states_every_field():
+  for name in suite.DESIGNS:
+    design = specs.load(name)
+    assert specs.load(design.to_mapping()).digest() == design.digest()
+
+
+def test_overrides_of_a_spec_do_not_state_its_initial_values(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+):
+  monkeypatch.chdir(tmp_path)
+  design = _with_extra()
+  design['providers'] = [*design['providers'], _WRITER]
+  override = f'providers={designs.SCORED["providers"]}'
+  loaded = specs.load(design)
+  (tmp_path / 'design.yaml').write_text(json.dumps(design))
+  run = experiment_specs.RunSpec(design='design.yaml', learner={'gamma': 0.9})
+  sources = (
+      design,
+      loaded,
+      specs.load(loaded, ['name=other']),
+      run.load(),
+  )
+  for source in sources:
+    text = refusals.refusal(specs.load, source, (override,))
+    assert text == f'override {override!r}: {_unwritten()}'
+
+
+def test_a_design_in_a_world_does_not_state_its_initial_values():
+  found = specs.load('myopic_approval').in_world('apple_seeker')
+  text = refusals.refusal(specs.load, found, ('learner=null', 'providers=[]'))
+  assert 'no provider writes this feedback register' in text
 
 
 def test_registers_of_shipped_designs_hold_every_action():

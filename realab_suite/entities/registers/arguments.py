@@ -46,7 +46,9 @@ class Arguments(validation.Spec):
     range: Lowest and highest value that can be stored, in each port.
     scale: Length in m (angle in rad for an orientation) per unit of value.
     initial: Value at the start of an episode, in each port; or the name of a
-      function that the task offers to meters, which returns it.
+      function that the task offers to meters, which returns it. A `feedback`
+      or `signal` register that no provider writes keeps it, and has to state
+      it.
     role: Role of the register. Agents read `feedback` and `signal` registers
       and write `query` registers. Only providers read `meter` registers. Only
       providers read and write `memory` registers.
