@@ -32,7 +32,8 @@ any depth of models and options, before any of them is opened.
 """
 
 # Classes of paths in the text of a schema.
-_PATH = re.compile(r"<class '(pathlib|os)\.\w+'>")
+# In Python 3.13, that of paths is `pathlib._local`.
+_PATH = re.compile(r"<class '(?:pathlib|os)(?:\.\w+)+'>")
 _BY_NAME = (
     inspect.Parameter.POSITIONAL_OR_KEYWORD,
     inspect.Parameter.KEYWORD_ONLY,
