@@ -238,16 +238,8 @@ def load(
     raise
   except Exception as error:  # Tasks may raise any class.
     location = messages.Location(f'task_kwargs of {domain_name}.{task_name}')
-    names = [*registry.argument_names(factory), 'random']
-    unknown = [key for key in kwargs if key not in names]
-    if unknown and 'unexpected keyword argument' in str(error):
-      hint = messages.did_you_mean(unknown[0], names)
-      hint = "; the seed is 'random'" if unknown[0] == 'seed' else hint
-      raise location.error(
-          f'unknown argument {messages.quote(unknown[0])}{hint}; allowed are'
-          f' {names}'
-      ) from error
-    raise location.error(messages.exception(error)) from error
+    problem = _problem_of_arguments(error, factory, kwargs)
+    raise location.error(problem) from error
   return embed(
       task,
       'none' if design is None else design,
@@ -255,6 +247,23 @@ def load(
       overrides=overrides,
       **options,
   )
+
+
+def _problem_of_arguments(
+    error: Exception, factory: Callable[..., Any], given: Mapping[str, Any]
+) -> str:
+  """Returns why a factory did not build a task from the given arguments."""
+  hint = "; the seed is 'random'" if 'seed' in given else ''
+  declared = registry.argument_names(factory)
+  if declared is not None and 'unexpected keyword argument' in str(error):
+    names = [*declared, 'random']
+    for key in given:
+      if key not in names:
+        return (
+            f'unknown argument {messages.quote(key)}'
+            f'{hint or messages.did_you_mean(key, names)}; allowed are {names}'
+        )
+  return f'{messages.exception(error)}{hint}'
 
 
 def load_batch(

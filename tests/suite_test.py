@@ -375,3 +375,10 @@ def test_what_is_misspelt_is_named_with_what_is_like_it(options, complaint):
   with pytest.raises(errors.SpecError) as raised:
     suite.load('unlock_door', 'near', design='instantaneous_reward', **options)
   assert complaint in str(raised.value)
+
+
+def test_no_arguments_are_listed_where_others_may_be_allowed():
+  with pytest.raises(errors.SpecError) as raised:
+    suite.load('dm_control/cartpole', 'balance', {'tme_limit': 5})
+  assert 'tme_limit' in str(raised.value)
+  assert 'allowed' not in str(raised.value)

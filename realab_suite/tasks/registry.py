@@ -143,18 +143,23 @@ def find(domain_name: str, task_name: str | None) -> TaskFactory:
   )
 
 
-def argument_names(factory: Callable[..., Any]) -> list[str]:
+def argument_names(factory: Callable[..., Any]) -> list[str] | None:
   """Returns the names of the keyword arguments that a factory declares.
 
   Args:
     factory: A function, a class that may pass arguments on to its base classes,
       or a partial function of one.
+
+  Returns:
+    The names; `None` if it passes arguments on to something else.
   """
   found = [inspect.signature(factory)]
   made = factory.func if isinstance(factory, functools.partial) else factory
   for one in inspect.getmro(made) if inspect.isclass(made) else ():
     if '__init__' in vars(one) and _passes_on(found[-1]):
       found.append(inspect.signature(vars(one)['__init__']))
+  if _passes_on(found[-1]):
+    return None
   # Subclasses give those of base classes that have positions.
   kinds = [
       (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY),
