@@ -3,8 +3,9 @@
   python -m campaigns.dependency_ranges build/ranges
 
 Needs uv, without constraints. In each environment, worlds are loaded, stepped
-and trained in, singly, in a batch and through Gymnasium. A warning, of this
-package or another one, ends the try.
+and trained in, singly, in a batch and through Gymnasium; in another one, whose
+versions of Gymnasium are newer, episodes are exported to Minari. A warning, of
+this package or another one, ends the try.
 """
 
 import pathlib
@@ -14,7 +15,7 @@ import sys
 # This package runs without labmaze, which has no wheels above Python 3.12.
 _OVERRIDE = 'labmaze; python_version < "3.13"\n'
 _RESOLUTIONS = {'newest': 'highest', 'oldest': 'lowest-direct'}
-_TRY = """
+_TRAINING = """
 import gymnasium
 import jax
 import mujoco
@@ -46,6 +47,28 @@ for _ in range(100):
 versions = [m.__version__ for m in (np, mujoco, gymnasium, jax)]
 print(f'{learner.num_steps} steps with numpy, mujoco, gymnasium, jax', versions)
 """
+_DATA = """
+import os
+import pathlib
+import sys
+import gymnasium
+import minari
+import pyarrow
+from realab_suite import worlds
+from realab_suite.datasets import export, sources
+from realab_suite.feedback import specs
+
+source = sources.of_policy(
+    'random', 'random', specs.load('instantaneous_reward'),
+    worlds.World('unlock_door', 'near'), seeds=[1], num_episodes=2)
+folder = export.export(source, pathlib.Path(sys.argv[1]), data_format='minari')
+os.environ['MINARI_DATASETS_PATH'] = str(folder / 'agent')
+[name] = minari.list_local_datasets()
+dataset = minari.load_dataset(name)
+versions = [m.__version__ for m in (minari, pyarrow, gymnasium)]
+print(f'{dataset.total_steps} steps with minari, pyarrow, gymnasium', versions)
+"""
+_TRIES = {'agents,report,gym': _TRAINING, 'data': _DATA}
 
 
 def main() -> None:
@@ -55,19 +78,20 @@ def main() -> None:
   override = folder / 'override.txt'
   override.write_text(_OVERRIDE)
   for name, resolution in _RESOLUTIONS.items():
-    env = folder / name
-    python = env / 'bin' / 'python'
-    for command in (
-        ['uv', 'venv', '-q', '--clear', '--python', sys.executable, env],
-        [
-            *('uv', 'pip', 'install', '-q', '--python', python),
-            *('--resolution', resolution, '--override', override),
-            '.[agents,report,gym]',
-        ],
-        # Warnings of start-up come from the packages of the environment.
-        [python, '-P', '-W', 'error', '-c', _TRY],
-    ):
-      subprocess.run(command, check=True)
+    for extras, source in _TRIES.items():
+      env = folder / f'{name}-{extras.replace(",", "-")}'
+      python = env / 'bin' / 'python'
+      for command in (
+          ['uv', 'venv', '-q', '--clear', '--python', sys.executable, env],
+          [
+              *('uv', 'pip', 'install', '-q', '--python', python),
+              *('--resolution', resolution, '--override', override),
+              f'.[{extras}]',
+          ],
+          # Warnings of start-up come from the packages of the environment.
+          [python, '-P', '-W', 'error', '-c', source, env / 'tried'],
+      ):
+        subprocess.run(command, check=True)
 
 
 if __name__ == '__main__':

@@ -23,9 +23,13 @@ xml = '<mujoco><worldbody><geom size="1"/></worldbody></mujoco>'
 mujoco.Physics.from_xml_string(xml).render(8, 8)
 """
 
+# The viewer draws with GLFW alone, whatever else can open a window.
 _OPENS_A_WINDOW = """
-import glfw
+from dm_control import _render
 from dm_control import viewer
+import glfw
+if _render.BACKEND != 'glfw':
+  raise RuntimeError(f'the viewer needs glfw, and MUJOCO_GL={_render.BACKEND}')
 if not glfw.init():
   raise RuntimeError('GLFW does not start')
 glfw.window_hint(glfw.VISIBLE, glfw.FALSE)

@@ -240,6 +240,16 @@ def test_exploring_where_no_window_opens_makes_a_film(monkeypatch):
   assert 'RuntimeError: no windows here' in ended.stdout
 
 
+@pytest.mark.usefixtures('egl')
+def test_the_viewer_gets_no_window_from_another_renderer(monkeypatch):
+  monkeypatch.setenv('DISPLAY', ':0')
+  # 'off' is dm_control's name for 'disable'.
+  for renderer, name in (('egl', 'egl'), ('disable', 'off')):
+    monkeypatch.setenv('MUJOCO_GL', renderer)
+    problem = renderers.why_no_window()
+    assert f'the viewer needs glfw, and MUJOCO_GL={name}' in problem
+
+
 def test_no_other_program_imports_the_viewer():
   importers = [
       path.stem
