@@ -22,7 +22,7 @@ _VARIABLE = 'MUJOCO_GL'
 _RENDERERS = {
     'egl': 'egl (headless)',
     'glfw': 'glfw (with a display)',
-    'osmesa': 'osmesa',
+    'osmesa': 'osmesa (if it is installed)',
 }
 # Renderers that dm_control starts when it is imported.
 _STARTED_BY_IMPORT = ('egl', 'osmesa')
@@ -62,14 +62,17 @@ def prepare() -> None:
     warnings.filterwarnings('ignore', _NO_DISPLAY, UserWarning)
 
 
-def what_to_set(renderer: str | None, error: Exception) -> str:
+def what_to_set(renderer: str | None, error: Exception | str) -> str:
   """Returns advice on an error: the renderer, the cause and alternatives."""
   lines = str(error).strip().splitlines()
   others = [text for name, text in _RENDERERS.items() if name != renderer]
+  named = os.environ.get(_VARIABLE)
+  # That of dm_control may have been chosen without the variable.
+  chosen = f'{_VARIABLE}={named}' if named else f'the renderer {renderer}'
   return (
-      f'MUJOCO_GL={renderer or "disable"}'
-      f' ({lines[0] if lines else type(error).__name__}); set MUJOCO_GL to'
-      f' {", ".join(others[:-1])} or {others[-1]} before Python starts'
+      f'{chosen} ({lines[0] if lines else type(error).__name__}); set'
+      f' {_VARIABLE} to {", ".join(others[:-1])} or {others[-1]} before Python'
+      ' starts'
   )
 
 

@@ -69,6 +69,12 @@ def _names(domain_name: Any, task_name: Any) -> tuple[Any, Any]:
   is_dotted = isinstance(domain_name, str) and '.' in domain_name
   if task_name is None and is_dotted:
     return task_names.split(domain_name)
+  if is_dotted and isinstance(task_name, Mapping):
+    raise errors.SpecError(
+        f'task_name: {messages.quote(task_name)}; {domain_name!r} contains the'
+        ' name of the task, so pass arguments by their names, such as'
+        f' task_kwargs={messages.quote(dict(task_name))}'
+    )
   return domain_name, task_name
 
 

@@ -359,7 +359,35 @@ def test_a_misspelt_function_is_named_beside_the_others():
         ),
         (
             {'overrides': ['schedule=cfmp']},
-            "got 'cfmp'; did you mean 'cfmdp'?",
+            "schedule=cfmp': schedule: must be 'cfmdp', got 'cfmp'; did you",
+        ),
+        (
+            {'overrides': ['schedule={meter_substep: 3, provider_substep: 2}']},
+            '}\': schedule: meter_substep 3 must not come after provider_s',
+        ),
+        (
+            {'overrides': ['registers.rewrd.scale=0.2']},
+            "place: required key is missing; did you mean 'registers.reward'?",
+        ),
+        (
+            {'overrides': ['learner={knd: q_learning}']},
+            "kind: required key is missing; is 'knd' meant to be 'kind'?",
+        ),
+        (
+            {'overrides': ['providers.0.reads=[scor]']},
+            "'scor' is not declared; did you mean 'score'?; declared are [",
+        ),
+        (
+            {'overrides': ['meters.0.measures=scor']},
+            "'scor' cannot be measured in this world; did you mean 'score'?",
+        ),
+        (
+            {'overrides': ['registers.reward.initial=scor']},
+            "this world does not offer 'scor'; did you mean 'score'?; allowed",
+        ),
+        (
+            {'overrides': ['learner.reward=rewrd']},
+            "not a register that agents read; did you mean 'reward'?; allowed",
         ),
         (
             {'overrides': ['registers.reward.place=station_9']},
@@ -375,6 +403,11 @@ def test_what_is_misspelt_is_named_with_what_is_like_it(options, complaint):
   with pytest.raises(errors.SpecError) as raised:
     suite.load('unlock_door', 'near', design='instantaneous_reward', **options)
   assert complaint in str(raised.value)
+
+
+def test_arguments_after_a_name_with_its_task_are_named():
+  with pytest.raises(errors.SpecError, match=r"so pass .* task_kwargs=\{'ran"):
+    suite.load('unlock_door.near', {'random': 1})
 
 
 def test_no_arguments_are_listed_where_others_may_be_allowed():

@@ -21,6 +21,7 @@ from realab_suite.entities import block_kinds
 from realab_suite.entities import protocols
 from realab_suite.entities import registers
 from realab_suite.feedback import specs
+from realab_suite.policies import base
 from realab_suite.policies import saboteurs
 
 # Rays may miss a block whose edge is nearer to their height, in m.
@@ -168,7 +169,8 @@ def make_policy(
   """Returns a policy for one episode; saboteurs get the block that they move.
 
   Args:
-    name: Name of the policy in `policies.POLICIES`.
+    name: Name of the policy in `policies.POLICIES`; `solver` is that of the
+      world.
     env: Environment. It may be reset, so rewind it before the episode.
     target: Register whose first block saboteurs move, or `None` for the first
       feedback register; if that cannot be moved, the first of `attacked`.
@@ -177,6 +179,7 @@ def make_policy(
   Raises:
     SpecError: If the policy or the register does not exist.
   """
+  name = _in_world(name, getattr(env.task, 'SOLVER', None))
   if not (takes := _aims(name)):
     return policies.make(name)
   env.rewind(episode)
@@ -216,6 +219,7 @@ def make_batch_policy(
   Raises:
     SpecError: If the policy does not exist, or the design has no register.
   """
+  name = _in_world(name, world.solver)
   if not _aims(name):
     return policies.make(name)
   with contextlib.closing(world.load(design, seed)) as env:
@@ -228,6 +232,11 @@ def make_batch_policy(
       places = positions(batch.physics, [block.block_in(batch)])
       policy = policy.starting_at(places[:, 0])
   return policy
+
+
+def _in_world(name: str, solver: str | None) -> str:
+  """Returns the name of a policy, where `solver` stands for that of a world."""
+  return solver or name if name == base.SOLVER else name
 
 
 def _aims(name: str) -> set[str]:

@@ -180,6 +180,26 @@ def apply_overrides(
   return result
 
 
+def hint_at_keys(override: str, data: Mapping[str, Any]) -> str:
+  """Returns a hint at the keys that a misspelt override may mean, or ''.
+
+  Args:
+    override: Override that can be applied.
+    data: Data that it is applied to.
+  """
+  keys, _ = _split(override)
+  node: Any = data
+  for depth, key in enumerate(keys):
+    if not isinstance(node, Mapping):
+      break
+    if key not in node:
+      close = messages.nearest(key, node)
+      meant = '.'.join([*keys[:depth], close or ''])
+      return f'; did you mean {meant!r}?' if close else ''
+    node = node[key]
+  return ''
+
+
 def override_name(override: object) -> str:
   """Returns the name of an override in error messages."""
   return f'override {messages.quote(override)}'

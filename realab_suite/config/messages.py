@@ -69,8 +69,18 @@ def did_you_mean(
     known: Known names.
     cutoff: Least likeness of a name in a hint, from 0 to 1.
   """
-  close = difflib.get_close_matches(str(given), known, n=1, cutoff=cutoff)
-  return f'; did you mean {close[0]!r}?' if close else ''
+  close = nearest(given, known, cutoff)
+  return '' if close is None else f'; did you mean {close!r}?'
+
+
+def nearest(
+    given: object, known: Iterable[str], cutoff: float = 0.6
+) -> str | None:
+  """Returns the known name that is most like a name, as in `did_you_mean`."""
+  close = difflib.get_close_matches(
+      str(given), list(known), n=1, cutoff=cutoff
+  )
+  return close[0] if close else None
 
 
 def exception(error: BaseException) -> str:

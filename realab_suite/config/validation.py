@@ -213,13 +213,16 @@ def validate(
     count = bisect.bisect(range(len(overrides)), False, lo=1, key=is_worse)
     if judged(count - 1)[0] is None:
       count = 0  # The data is wrong without the override, too.
+  hint = ''
   if count:
-    where = loading.override_name(overrides[count - 1])
+    override = overrides[count - 1]
+    where = loading.override_name(override)
+    hint = loading.hint_at_keys(override, data)
   problems = judged(count)[1]
   told = problems[:_MAX_TOLD]
   if len(problems) > _MAX_TOLD:
     told.append(f'and {len(problems) - _MAX_TOLD} more')
-  raise messages.Location(where).error('; '.join(told))
+  raise messages.Location(where).error('; '.join(told) + hint)
 
 
 def are_paths_confined(info: pydantic.ValidationInfo) -> bool:
@@ -254,12 +257,30 @@ def _problems(error: pydantic.ValidationError, data: Any) -> list[str]:
       if one['type'] != 'too_short'
       or len(one['input']) < one['ctx']['min_length']
   ]
+  told = [one for one in told if not _is_of_another_member(one, told, data)]
   # A union may report a problem once for each of its members.
   return list(
       dict.fromkeys(
           ': '.join(filter(None, (_path(one, data), _describe(one))))
           for one in told
       )
+  )
+
+
+def _is_of_another_member(details: Any, others: Any, data: Any) -> bool:
+  """Returns whether a problem is of a member of a union that was not meant.
+
+  A text was meant as one of the names that a union allows, and a mapping as the
+  model beside them.
+  """
+  is_text = isinstance(details['input'], str)
+  is_name = details['type'] == 'literal_error'
+  if is_name == is_text:
+    return False
+  return any(
+      (other['type'] == 'literal_error') != is_name
+      and _path(other, data) == _path(details, data)
+      for other in others
   )
 
 
@@ -292,7 +313,10 @@ def _describe(details: Any) -> str:
   if _is_item(details):
     return f'must have at least {details["loc"][-1] + 1} items, got {given}'
   if details['type'] == 'missing':
-    return 'required key is missing'
+    name = details['loc'][-1]
+    close = messages.nearest(name, map(str, details['input']))
+    hint = f'; is {close!r} meant to be {name!r}?' if close else ''
+    return f'required key is missing{hint}'
   if details['type'] in _IN_WORDS_OF_YAML:
     return f'must be {_IN_WORDS_OF_YAML[details["type"]]}, got {given}'
   if 'error' not in details.get('ctx', {}):

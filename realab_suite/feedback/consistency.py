@@ -72,8 +72,9 @@ def _expect_role(
   """
   if name not in design.ports:
     raise ValueError(
-        f'{where}: register {messages.quote(name)} is not declared; declared'
-        f' are {sorted(design.ports)}'
+        f'{where}: register {messages.quote(name)} is not declared'
+        f'{messages.did_you_mean(name, design.ports)}; declared are'
+        f' {sorted(design.ports)}'
     )
   role = design.ports[name].role
   if roles is not None and role not in roles:
@@ -232,6 +233,6 @@ def _check_learner(design: Any) -> None:
     for name in names:
       if name not in known:
         raise ValueError(
-            f'learner: {messages.quote(name)} is not a {what}; allowed are'
-            f' {known}'
+            f'learner: {messages.quote(name)} is not a {what}'
+            f'{messages.did_you_mean(name, known)}; allowed are {known}'
         )

@@ -330,8 +330,9 @@ class FeedbackMechanism(modelled.ModelledEntity):
         if any(name not in functions for name in names):
           raise errors.SpecError(
               f'design {self._design.name!r}: registers.{name}.initial: this'
-              f' world does not offer {initial!r}; allowed are numbers and'
-              f' {sorted(functions)}'
+              f' world does not offer {initial!r}'
+              f'{messages.did_you_mean(initial, functions)}; allowed are'
+              f' numbers and {sorted(functions)}'
           )
         values = [functions[name] for name in names]
         register.start_with(_stacked(values) if register.PORTS else values[0])

@@ -33,7 +33,7 @@ def main() -> None:
   if flags.VIDEO.value is not None:
     _write_film()
   elif problem := renderers.why_no_window():
-    program.say(f'No window can be opened, so this writes a film: {problem}')
+    program.say(f'No window can be opened: {problem}')
     _write_film()
   else:
     _open_window()

@@ -86,7 +86,8 @@ EPISODES = _define_integer(
 POLICY = _define_string(
     'policy',
     'random',
-    'Name of a scripted policy; no_op stands still.',
+    'Name of a scripted policy; no_op stands still, and solver is the one of'
+    ' the world. Without it, `explore` shows a saboteur.',
 )
 
 # The world and the design.
@@ -98,8 +99,8 @@ DOMAIN = _define_string(
 TASK = _define_string(
     'task',
     'standard',
-    'Task of the domain: standard, near, far or boxed; or with its domain, such'
-    ' as unlock_door.near.',
+    'Task of the domain, such as standard, near or far; or with its domain,'
+    ' such as unlock_door.near.',
 )
 MAX_STEPS = _define_integer(
     'max_steps',

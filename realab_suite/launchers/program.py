@@ -33,8 +33,11 @@ def _parse(argv: Sequence[str]) -> list[str]:
   # By default only warnings are logged, because dm_control logs details of its
   # renderer. A flag on the command line comes later and takes precedence.
   program, *rest = argv
+  rest = ['--help' if one == '-h' else one for one in rest]
   try:
     return flags.FLAGS([program, f'--verbosity={logging.WARNING}', *rest])
+  except SystemExit:  # absl calls it a failure to have shown the flags.
+    sys.exit(0)
   except flags.Error as error:
     _print_error(str(error))
     sys.exit(USAGE_ERROR)

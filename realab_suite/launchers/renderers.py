@@ -47,6 +47,7 @@ def choose_renderer() -> str | None:
     The problem of each renderer, in one line, or `None` if one works.
   """
   problems = []
+  is_named = _display.is_named()
   for renderer in _candidates():
     if renderer == 'disable':
       problem = 'rendering is turned off by MUJOCO_GL'
@@ -56,7 +57,10 @@ def choose_renderer() -> str | None:
     if not problem:
       _name(renderer)
       return None
-    problems.append(f'{renderer}: {problem}')
+    if is_named:
+      problems.append(_display.what_to_set(renderer, problem))
+    else:
+      problems.append(f'{renderer}: {problem}')
   _name('disable')
   return '; '.join(problems)
 

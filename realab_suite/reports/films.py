@@ -115,15 +115,24 @@ def film(
     stream.options = codec_options
     stack.pop_all()
 
+  is_empty = True
+
   def add(unused_physics: protocols.Physics, track: tracking.Track) -> None:
+    nonlocal is_empty
+    is_empty = False
     env.thin_physics.refresh()
     picture = np.concatenate([one.render() for one in cameras], axis=1)
     strip = draw_strip(title, track, picture.shape[1])
     # Players show their controls over the lower edge of a paused film.
     file.write_frame(np.concatenate([strip, picture], axis=0))
 
-  with contextlib.closing(file):
-    yield add
+  try:
+    with contextlib.closing(file):
+      yield add
+  except BaseException:
+    if is_empty:
+      os.remove(path)
+    raise
 
 
 @contextlib.contextmanager

@@ -101,7 +101,8 @@ def check_register(
     )
   _check_batch(world)
   for width in _WIDE:
-    _check_wide_range(kind, options, width)
+    for is_upward in (True, False):
+      _check_wide_range(kind, options, width, is_upward)
 
 
 @final
@@ -238,7 +239,10 @@ def _check_values(subject: _Subject) -> None:
 
 
 def _check_wide_range(
-    kind: type[registers.Register], options: dict[str, Any], width: float
+    kind: type[registers.Register],
+    options: dict[str, Any],
+    width: float,
+    is_upward: bool,
 ) -> None:
   """Checks that a register stores each value of a wide range, or refuses it.
 
@@ -246,9 +250,15 @@ def _check_wide_range(
     kind: Class of the register.
     options: Arguments of the class.
     width: Width of the range, in m or rad.
+    is_upward: True to raise the upper end of the range, False to lower the
+      lower end.
   """
   low, high = options['value_range']
-  high = max(high, low + width / options.get('scale', _SCALE))
+  units = width / options.get('scale', _SCALE)
+  if is_upward:
+    high = max(high, low + units)
+  else:
+    low = min(low, high - units)
   try:
     world = _World(kind, {**options, 'value_range': (low, high)})
   except errors.SpecError:

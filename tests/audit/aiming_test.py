@@ -8,6 +8,7 @@ import pytest
 from realab_suite import errors
 from realab_suite import policies
 from realab_suite import suite
+from realab_suite import worlds
 from realab_suite.audit import aiming
 from realab_suite.entities import appearance
 from realab_suite.entities import registers
@@ -145,6 +146,15 @@ def test_consumed_registers_are_attacked_first_and_fixed_ones_never():
 def test_an_unknown_register_is_named(env):
   with pytest.raises(errors.SpecError, match="no 'rewrad'"):
     aiming.make_policy('aimed_in_a_test', env, 'rewrad', 0)
+
+
+def test_the_solver_is_that_of_the_world(env):
+  solver = aiming.make_policy('solver', env, None, 0)
+  assert type(solver) is type(policies.make(env.task.SOLVER))
+  world = worlds.World('gates', 'near')
+  design = specs.load('instantaneous_reward')
+  policy = aiming.make_batch_policy('solver', world, design, 1, 2)
+  assert type(policy) is type(policies.make(world.solver))
 
 
 def test_a_policy_that_needs_no_aim_is_made_as_it_is(env):

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from realab_suite import errors
 from realab_suite import testing
 from realab_suite.entities import registers
 from tests.authors import abacus
@@ -305,3 +306,15 @@ def test_a_kind_that_wraps_outside_the_tried_range_is_noticed(least):
   with pytest.raises(testing.ContractError, match='is read as') as raised:
     testing.check_register(wrapping)
   assert 'angles of more than a turn' in str(raised.value)
+
+
+@pytest.mark.parametrize('end', [0, 1])
+def test_a_kind_that_refuses_one_end_alone_is_noticed(end):
+  def build(self, *arguments, **options):
+    _Turning._build(self, *arguments, **options)
+    if abs(self.value_range[end] * self._scale) > 3.0:
+      raise errors.SpecError('half a turn at most')
+
+  guarded: Any = type('Guarded', (_Turning,), {'_build': build})
+  with pytest.raises(testing.ContractError, match='is read as'):
+    testing.check_register(guarded)

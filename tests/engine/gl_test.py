@@ -224,7 +224,7 @@ def test_a_picture_without_a_renderer_names_the_setting():
       # EGL finds no driver here.
       __EGL_VENDOR_LIBRARY_DIRS='/nonexistent',
   )
-  assert 'MUJOCO_GL=egl (' in printed
+  assert 'no picture with the renderer egl (' in printed
   assert 'set MUJOCO_GL to glfw (with a display) or osmesa' in printed
   assert len(printed.splitlines()) == 1
 

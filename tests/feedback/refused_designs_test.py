@@ -46,8 +46,8 @@ _WRONG = {
     'registers.reward.channel=weld':
         "channel: must be 'embedded', 'welded' or 'secure', got 'weld'",
     'meters.0.writes=scores':
-        "meters[0].writes: register 'scores' is not declared; declared are"
-        " ['reward', 'score']",
+        "meters[0].writes: register 'scores' is not declared; did you mean"
+        " 'score'?; declared are ['reward', 'score']",
     'meters.0.writes=reward':
         "meters[0].writes: register 'reward' has role 'feedback'; allowed are"
         " ['meter']",
@@ -110,7 +110,7 @@ _DOES_NOT_FIT = {
         " are ['centre', 'east_wall'",
     'meters.0.measures=scor':
         "design 'd': meters[0].measures: 'scor' cannot be measured in this"
-        " world; allowed are ['score']",
+        " world; did you mean 'score'?; allowed are ['score']",
     'registers.reward.place=[0, 0] & registers.reward.range=[0, 200]':
         "register 'reward' at value 200 would be at (20, 0.25), outside the"
         ' arena (-4, -4) to (4, 4)',

@@ -207,7 +207,26 @@ def test_exploring_without_a_renderer_gives_one_line(tmp_path):
   )  # fmt: skip
   assert ran.returncode == 2
   assert len(ran.stderr.splitlines()) == 1
-  assert 'no renderer for a film' in ran.stderr
+  assert 'no renderer for a film: MUJOCO_GL=disable (' in ran.stderr
+  assert 'set MUJOCO_GL to egl (headless), glfw' in ran.stderr
+
+
+@pytest.mark.usefixtures('egl')
+def test_a_film_without_a_frame_is_removed(tmp_path):
+  film = tmp_path / 'film.mp4'
+  ran = _run(
+      *('--senses=camera', '--policy=apple_seeker', f'--video={film}'),
+      module='realab_suite.launchers.explore',
+      MUJOCO_GL='egl',
+  )
+  assert 'needs the senses' in ran.stderr
+  assert not film.exists()
+
+
+def test_to_show_the_flags_is_no_failure():
+  ran = _run('-h', module='realab_suite.launchers.explore')
+  assert (ran.returncode, ran.stderr) == (0, '')
+  assert '--policy: Name of a scripted policy' in ran.stdout
 
 
 @pytest.mark.usefixtures('egl')
@@ -326,7 +345,7 @@ def test_a_renderer_that_does_not_work_is_refused_in_one_line(monkeypatch):
   monkeypatch.setenv('MUJOCO_GL', 'crayons')
   problem = renderers.choose_renderer()
   assert problem is not None
-  assert problem.startswith('crayons: ')
+  assert problem.startswith('MUJOCO_GL=crayons (')
   assert len(problem.splitlines()) == 1
   assert os.environ['MUJOCO_GL'] == 'disable'
 
@@ -337,7 +356,7 @@ def test_a_renderer_that_does_not_work_is_refused_in_one_line(monkeypatch):
         ([], '--input: missing'),
         (['--input=a'], '--run: missing'),
         (['--input=a', '--run=b'], '--video: missing'),
-        (['--input=a', '--run=b', '--video=c.mp4'], 'cannot make a film: disa'),
+        (['--input=a', '--run=b', '--video=c.mp4'], 'film: MUJOCO_GL=disable'),
     ],
 )
 def test_a_film_needs_a_run_and_a_renderer(monkeypatch, arguments, complaint):

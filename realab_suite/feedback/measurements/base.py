@@ -162,8 +162,8 @@ class World:
     """Returns the error for a name that is not one of the known names."""
     return self.error(
         field,
-        f'{messages.quote(name)} cannot be measured in this world; allowed are'
-        f' {_listed(known)}',
+        f'{messages.quote(name)} cannot be measured in this world'
+        f'{messages.did_you_mean(name, known)}; allowed are {_listed(known)}',
     )
 
   def error(self, field: str, problem: str) -> errors.SpecError:
@@ -255,7 +255,8 @@ def _without_options(name: str, world: World) -> Measurement:
   kinds = sorted(MEASUREMENTS)
   if name not in MEASUREMENTS:
     raise world.location.error(
-        f'{messages.quote(name)} cannot be measured in this world; allowed are'
+        f'{messages.quote(name)} cannot be measured in this world'
+        f'{messages.did_you_mean(name, world.functions)}; allowed are'
         f' {_listed(world.functions)}, and mappings with a kind of {kinds}'
     )
   try:
