@@ -363,7 +363,7 @@ def test_a_misspelt_function_is_named_beside_the_others():
         ),
         (
             {'overrides': ['schedule={meter_substep: 3, provider_substep: 2}']},
-            '}\': schedule: meter_substep 3 must not come after provider_s',
+            "}': schedule: meter_substep 3 must not come after provider_s",
         ),
         (
             {'overrides': ['registers.rewrd.scale=0.2']},

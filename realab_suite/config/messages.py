@@ -77,9 +77,7 @@ def nearest(
     given: object, known: Iterable[str], cutoff: float = 0.6
 ) -> str | None:
   """Returns the known name that is most like a name, as in `did_you_mean`."""
-  close = difflib.get_close_matches(
-      str(given), list(known), n=1, cutoff=cutoff
-  )
+  close = difflib.get_close_matches(str(given), list(known), n=1, cutoff=cutoff)
   return close[0] if close else None
 
 
