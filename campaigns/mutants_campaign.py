@@ -179,13 +179,12 @@ MUTANTS = [
     ),
     planting.Mutant(
         'contract', 'meters do not measure', _CONTROL_STEP,
-        '''  step.update_meters(where())
+        '''  records += mechanism.update_meters(view, where())
 ''', '', _MECH,
     ),
     planting.Mutant(
         'contract', 'queries are not written', _CONTROL_STEP,
-        '''  step.write_queries(queries)
-''', '', _MECH,
+        'list(mechanism.write_queries(view, queries))', '[]', _MECH,
     ),
     planting.Mutant(
         'contract', 'a provider that raises leaves the episode open',

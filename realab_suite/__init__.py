@@ -22,7 +22,6 @@ if TYPE_CHECKING:
   from realab_suite.suite import fork
   from realab_suite.suite import load
   from realab_suite.suite import load_batch
-  from realab_suite.suite import plain_task
 
 __version__ = '0.2.0'
 
@@ -33,7 +32,6 @@ __all__ = [
     'load',
     'load_batch',
     'make_policy',
-    'plain_task',
 ]
 
 # Module and name of each function. Parts of the package need no world, so
@@ -45,7 +43,6 @@ _FUNCTIONS = {
     'load': ('suite', 'load'),
     'load_batch': ('suite', 'load_batch'),
     'make_policy': ('policies', 'make'),
-    'plain_task': ('suite', 'plain_task'),
 }
 
 

@@ -29,7 +29,6 @@ from realab_suite.engine import environment
 from realab_suite.engine import foreign
 from realab_suite.engine import forking
 from realab_suite.engine import hosts
-from realab_suite.engine import plain
 from realab_suite.engine import seeding
 from realab_suite.feedback import mechanisms
 from realab_suite.feedback import specs
@@ -407,24 +406,6 @@ def embed(
     foreign.make_host(task).remove_registers(mechanism)
     mechanism.detach_from_root()
     raise
-
-
-def plain_task(
-    task: composer.Task, design: specs.Design, **options: Any
-) -> plain.PlainTask:
-  """Returns a task with the feedback of a design, for `composer.Environment`.
-
-  `docs/composer.md` describes its use.
-
-  Args:
-    task: Composer task; the registers are attached to its root entity.
-    design: Same as in `embed`.
-    **options: Same as in `embed`.
-
-  Raises:
-    SpecError: If the design is wrong or does not fit the task.
-  """
-  return plain.PlainTask(embed(task, design, **options))
 
 
 def _connected(

@@ -32,83 +32,6 @@ class Outcome(NamedTuple):
   provider_states: list[Any]
 
 
-@final
-class ControlStep:
-  """The phases of one control step, between which the physics runs.
-
-  The caller calls the methods once each and in their order. `run` runs the
-  physics between them; in a plain Composer environment, Composer does.
-  """
-
-  def __init__(
-      self,
-      physics: hosts.SteppedPhysics,
-      host: hosts.Host,
-      mechanism: mechanisms.FeedbackMechanism,
-      view: Any = None,
-  ) -> None:
-    """Begins a control step, before anything has changed.
-
-    Args:
-      physics: Physics of one world or of a batch.
-      host: Host of the task.
-      mechanism: Registers, meters and providers.
-      view: Physics through which registers are accessed; `None` for that of the
-        host.
-    """
-    self._physics = physics
-    self._view = host.view(physics) if view is None else view
-    self._host = host
-    self._mechanism = mechanism
-    self._was_over = host.is_over(physics)
-    self._is_ending: Any = False
-    self._records: list[registers.Record] = []
-    self._next_states: list[Any] = []
-
-  def write_queries(self, queries: np.ndarray) -> None:
-    """Writes the agent's queries, `(..., queries)`, after `before_step`."""
-    self._records += self._mechanism.write_queries(self._view, queries)
-
-  def update_meters(self, where: axes.Mask = None) -> None:
-    """Measures and writes the meter registers, after `meter_substep` substeps.
-
-    Args:
-      where: Worlds in which meters write; `None` for all worlds.
-    """
-    self._is_ending = self._host.is_over(self._physics)
-    self._records += self._mechanism.update_meters(self._view, where)
-
-  def update_providers(
-      self,
-      observation: dict[str, np.ndarray],
-      keys: np.ndarray,
-      states: Sequence[Any],
-      where: axes.Mask = None,
-  ) -> None:
-    """Runs the providers, after `provider_substep` substeps.
-
-    Args:
-      observation: Observation that the action responds to, by name.
-      keys: Random key of each provider in this episode, `(providers, ..., 2)`
-        uint64.
-      states: State of each provider.
-      where: Worlds in which providers write; `None` for all worlds.
-    """
-    feedback, self._next_states = self._mechanism.update_providers(
-        self._view, observation, keys, states, where
-    )
-    self._records += feedback
-
-  def end(self) -> Outcome:
-    """Ends the step, after the last substep and the hooks that follow it."""
-    ending = self._host.end_step(self._physics, self._was_over, self._is_ending)
-    reward = ending.true_reward
-    self._mechanism.end_step(
-        self._physics, axes.choose(axes.is_finite(reward), reward, 0.0)
-    )
-    return Outcome(self._records, ending, self._next_states)
-
-
 def run(
     physics: hosts.SteppedPhysics,
     host: hosts.Host,
@@ -148,17 +71,25 @@ def run(
     FeedbackProviderError: If a provider failed.
     RegisterValueError: If a written value cannot be stored.
   """
-  step = ControlStep(physics, host, mechanism)
+  view = host.view(physics)
+  was_over = host.is_over(physics)
   host.begin_step(physics, controls)
-  step.write_queries(queries)
+  records = list(mechanism.write_queries(view, queries))
 
   host.advance(physics, controls, schedule.meter_substep, is_last=False)
-  step.update_meters(where())
+  is_ending = host.is_over(physics)
+  records += mechanism.update_meters(view, where())
 
   between = schedule.provider_substep - schedule.meter_substep
   host.advance(physics, controls, between, is_last=False)
-  step.update_providers(observation, provider_keys, provider_states, where())
+  feedback, next_states = mechanism.update_providers(
+      view, observation, provider_keys, provider_states, where()
+  )
+  records += feedback
 
   rest = num_substeps - schedule.provider_substep
   host.advance(physics, controls, rest, is_last=True)
-  return step.end()
+  ending = host.end_step(physics, was_over, is_ending)
+  reward = ending.true_reward
+  mechanism.end_step(physics, axes.choose(axes.is_finite(reward), reward, 0.0))
+  return Outcome(records, ending, next_states)

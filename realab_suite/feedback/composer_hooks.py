@@ -2,8 +2,8 @@
 
 Composer calls the hooks of entities in the order of attachment and passes them
 neither the action nor the agent's observation. A mechanism that is attached to
-an arena therefore runs designs that need only registers and meters. For other
-designs, a wrapper of the task gets the rest: `suite.plain_task`.
+an arena therefore runs designs that need only registers and meters;
+`suite.embed` runs all of them.
 
 The phases run before a substep. All entities have then seen the result of the
 previous one, so it does not matter whether the mechanism was attached before or
@@ -162,7 +162,7 @@ class ComposerHooks(composer.Entity):
     if needs := _needs(mechanism):
       raise errors.SpecError(
           f'design {name!r} needs {", ".join(needs)}, which entities of'
-          ' Composer do not get; use suite.plain_task(task, design)'
+          ' Composer do not get; use suite.embed(task, design)'
       )
     outside = [n for n, r in mechanism.registers.items() if r.parent is None]
     if outside:

@@ -169,14 +169,9 @@ class FeedbackMechanism(modelled.ModelledEntity):
     if self._hooks is not None:
       yield self._hooks
 
-  def leave_phases(self, hooks: composer.Entity | None = None) -> None:
-    """Leaves the phases of control steps to the caller.
-
-    Args:
-      hooks: Entity whose hooks Composer calls after those of all entities that
-        were attached earlier; `None` for no hooks.
-    """
-    self._hooks = hooks
+  def leave_phases(self) -> None:
+    """Leaves the phases of control steps to the caller."""
+    self._hooks = None
 
   @property
   def design(self) -> specs.DesignSpec:

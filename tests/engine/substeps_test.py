@@ -112,9 +112,9 @@ def test_blocks_that_the_substeps_do_not_fit_are_refused(
     [
         lambda design: suite.load(*_WORLD, design=design),
         lambda design: suite.load_batch(*_WORLD, num_envs=2, design=design),
-        lambda design: suite.plain_task(_FAR, design),
+        lambda design: suite.embed(_FAR, design),
     ],
-    ids=['alone', 'batch', 'plain'],
+    ids=['alone', 'batch', 'embedded'],
 )
 def test_every_way_to_load_refuses_such_blocks(load: Any):
   with pytest.raises(

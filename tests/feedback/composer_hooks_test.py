@@ -299,7 +299,7 @@ def test_what_composer_does_not_pass_to_entities_is_refused(make, need):
     composer.Environment(_Push(arena, pusher))
   assert str(caught.value) == (
       f"design 'pushed' needs {need}, which entities of Composer do not get;"
-      ' use suite.plain_task(task, design)'
+      ' use suite.embed(task, design)'
   )
 
 

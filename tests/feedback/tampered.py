@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 import contextlib
 from typing import Any, Literal, NamedTuple, final
 
-from dm_control import composer
 import numpy as np
 
 from realab_suite import suite
@@ -19,7 +18,7 @@ from realab_suite.policies import random_keys
 from tests.engine import helpers
 from tests.evaluation import rooms
 
-HOSTS = ('single', 'batch', 'embedded', 'plain')
+HOSTS = ('single', 'batch', 'embedded')
 NUM_ENVS = 3
 # In a batch, this world has the moves of the script, the others are honest.
 TAMPERED = 1
@@ -161,15 +160,14 @@ class World:
     mechanism: Its mechanism.
     num_envs: Number of worlds of a batch.
     is_batch: True for a batch.
-    task: The task, which gives a plain environment its sinks.
     time_step: Time step of the agent, or of the agents of a batch.
   """
 
   def __init__(self, host: str, design: Any, num_envs: int = NUM_ENVS) -> None:
-    is_foreign = host in ('embedded', 'plain')
+    is_foreign = host == 'embedded'
     task = helpers.PointTask() if is_foreign else rooms.EmptyRoom()
     duration = task.control_timestep
-    env: Any = (suite.plain_task if host == 'plain' else suite.embed)(
+    env: Any = suite.embed(
         task, design, random=7, max_steps=50,
         measurements={
             'steps': lambda physics: np.floor(
@@ -178,10 +176,8 @@ class World:
         },
         **({'world': TAMPERED} if host == 'single' else {}),
     )  # fmt: skip
-    self.mechanism, self.task = env.mechanism, env
-    if host == 'plain':
-      env = composer.Environment(env, strip_singleton_obs_buffer_dim=True)
-    elif host == 'batch':
+    self.mechanism = env.mechanism
+    if host == 'batch':
       env = batch_environment.BatchEnvironment(env, num_envs, 1)
     self.env = env
     self.num_envs = num_envs
