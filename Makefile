@@ -15,10 +15,9 @@ WORKERS = 2
 
 # Files with tests that need other extras than `.venv/dev` has.
 TESTS_OF_EXTRAS = tests/authors tests/datasets tests/engine/gl_test.py \
-	tests/experiments/offline_test.py tests/experiments/played_test.py \
+	tests/experiments/offline_test.py \
 	tests/experiments/supervised_test.py tests/experiments/training_test.py \
-	tests/interop tests/launchers/data_test.py \
-	tests/reports/replay_pages_test.py
+	tests/interop tests/launchers/data_test.py
 
 .PHONY: help demo test lint docs check-release format clean
 

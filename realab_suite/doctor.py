@@ -70,10 +70,7 @@ EXTRAS: Mapping[str, Extra] = {
         ('pyarrow', 'minari', 'gymnasium', 'h5py', 'PIL'),
         'exports to Parquet and Minari',
     ),
-    'browser': Extra(
-        ('viser', 'mjviser', 'websockets', 'PIL'),
-        'replays in 3D and pages for people',
-    ),
+    'browser': Extra(('websockets', 'PIL'), 'pages for people who supervise'),
     'cluster': Extra(('ray', 'submitit'), 'sweeps on a cluster'),
     'docs': Extra(
         ('sphinx', 'furo', 'myst_nb'), 'the site of the documentation'

@@ -73,9 +73,7 @@ _MAY_IMPORT = {
     'audit': (*_WITH_SUITE, 'worlds'),
     'interop': _WITH_SUITE,
     'experiments': (*_WITH_SUITE, 'worlds', 'audit', 'agents', 'interop'),
-    'reports': (
-        *_WITH_SUITE, 'worlds', 'audit', 'agents', 'interop', 'experiments',
-    ),
+    'reports': (*_WITH_SUITE, 'worlds', 'audit', 'agents', 'experiments'),
     # Runs and replays, and nothing that draws.
     'datasets': (
         *_WITH_SUITE,

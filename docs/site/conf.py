@@ -56,10 +56,8 @@ autodoc_inherit_docstrings = False
 # Packages of extras that the site does without.
 autodoc_mock_imports = [
     'minari',
-    'mjviser',
     'pyarrow',
     'stable_baselines3',
-    'viser',
 ]
 napoleon_use_ivar = True
 napoleon_numpy_docstring = False

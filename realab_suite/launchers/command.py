@@ -29,8 +29,6 @@ COMMANDS: Mapping[str, str] = {
     'label': 'make a labelled dataset of tampering',
     'make_networks': 'train the networks of demonstrators and advisers',
     'pack': 'pack the finished jobs of a sweep into a file',
-    'play': 'act in a world by keyboard',
-    'replay': 'write episodes in 3D as pages',
     'report': 'write the report of a sweep',
     'scorecard': 'write the scorecard of a suite',
     'serve': 'serve a world to an agent in another process',

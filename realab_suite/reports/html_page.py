@@ -4,10 +4,8 @@ The pictures and films are made by `charts` and `page_episodes`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-import os
 import pathlib
 from typing import Any
-from urllib import parse
 
 import jinja2
 import numpy as np
@@ -134,7 +132,6 @@ def _render(
       no_paths=no_paths,
       clips=[clip for clip in clips if clip is not film],
       no_clips=no_clips,
-      replays=_replays(sweep, output),
       records=[
           table for table in (_made_with(sweep), _speeds(sweep)) if table.rows
       ],
@@ -178,21 +175,6 @@ def _units(learned: Sequence[numbers.Figures]) -> str:
   if True in single:
     return 'over seeds, or over episodes where there is one seed'
   return 'over seeds'
-
-
-def _replays(
-    sweep: sweep_results.Sweep, output: pathlib.Path
-) -> list[tuple[str, str]]:
-  """Returns the names and relative addresses of the replays of a sweep."""
-  folder = sweep.folder / sweep_results.REPLAYS
-  relative = os.path.relpath(folder.resolve(), output.resolve())
-  return [
-      (
-          path.stem,
-          parse.quote(pathlib.PurePath(relative, path.name).as_posix()),
-      )
-      for path in sorted(folder.glob('*.html'))
-  ]
 
 
 def _template() -> jinja2.Template:

@@ -24,9 +24,6 @@ from realab_suite.experiments import storage
 from realab_suite.experiments import training
 from realab_suite.feedback import specs
 
-REPLAYS = 'replays'
-"""Folder of the pages with replays, in the folder of a sweep."""
-
 
 @final
 class Job(pydantic.BaseModel):

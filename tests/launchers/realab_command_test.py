@@ -17,8 +17,8 @@ from realab_suite import doctor
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import requirements
 from realab_suite.launchers import command
-from realab_suite.launchers import play
 from realab_suite.launchers import renderers
+from realab_suite.launchers import supervise
 from tests.launchers import in_process
 
 _ROOT = pathlib.Path(__file__).parents[2]
@@ -177,7 +177,7 @@ def test_a_demo_without_its_extras_is_refused_at_once(
 
 
 def test_pages_need_an_address():
-  complaint = in_process.complaint(play, '--host=')
+  complaint = in_process.complaint(supervise, '--host=')
   assert 'allowed are addresses, such as 127.0.0.1' in complaint
 
 

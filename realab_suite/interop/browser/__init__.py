@@ -1,1 +1,1 @@
-"""Worlds in a browser: 3D recordings, and pages for people."""
+"""A page in a browser, for people who supervise."""

@@ -19,7 +19,7 @@ _ARGUMENTS = (
 
 def needed():
   """Skips the test where Chromium or the extra `browser` is missing."""
-  for module in ('viser', 'mjviser', 'websockets', 'PIL', 'playwright'):
+  for module in ('websockets', 'PIL', 'playwright'):
     pytest.importorskip(module)
   if _executable() is None:
     pytest.skip('there is no Chromium; install it, or set CHROMIUM to its path')

@@ -25,7 +25,7 @@ _UPGRADE = (
 
 @pytest.fixture(name='server')
 def fixture_server():
-  with servers.PageServer('play') as server:
+  with servers.PageServer('supervise') as server:
     yield server
 
 
@@ -103,4 +103,4 @@ def test_a_message_that_cannot_be_parsed_is_dropped(server, text):
 def test_a_port_in_use_is_refused(server):
   port = int(server.url.split(':')[2].split('/')[0])
   with pytest.raises(errors.SpecError, match='cannot serve a page'):
-    servers.PageServer('play', port=port)
+    servers.PageServer('supervise', port=port)
