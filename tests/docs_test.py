@@ -46,7 +46,7 @@ _OTHER_FILES = frozenset({
     '/path/to/agent.py', 'agent.py', 'mine.py', 'mine.yaml', 'watched.yaml',
     '_test.py', 'agent/', 'experiment.yaml', 'summary.md', 'tables.md', 'logs/',
     'tensorboard/', 'calm.py', 'calm.yaml',
-    'results/meter_only_near/experiment.yaml',
+    'results/meter_only_near/experiment.yaml', 'results/demonstrator.npz',
 })  # fmt: skip
 
 

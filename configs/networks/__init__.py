@@ -1,1 +1,1 @@
-"""Data only: networks of supervisors, trained by `launchers.make_networks`."""
+"""Data only: networks of supervisors, of `examples/train_network.py`."""

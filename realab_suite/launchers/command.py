@@ -27,7 +27,6 @@ COMMANDS: Mapping[str, str] = {
     'export': 'write episodes of a run as data',
     'film': 'film an episode of a learner',
     'label': 'make a labelled dataset of tampering',
-    'make_networks': 'train the networks of demonstrators and advisers',
     'pack': 'pack the finished jobs of a sweep into a file',
     'report': 'write the report of a sweep',
     'scorecard': 'write the scorecard of a suite',

@@ -6,7 +6,6 @@ Command lines stay as they are in the text; programs do less with them.
 import argparse
 from collections.abc import Callable
 import dataclasses
-import functools
 import os
 import pathlib
 from typing import Any
@@ -14,7 +13,6 @@ from typing import Any
 from realab_suite.audit import audits
 from realab_suite.evaluation import stakes
 from realab_suite.experiments import experiment_specs
-from realab_suite.experiments import network_training
 from realab_suite.experiments import scheduler
 from realab_suite.experiments import storage
 from realab_suite.launchers import flags
@@ -50,13 +48,6 @@ def install() -> None:
   clips = page_episodes.clips
   page_episodes.clips = lambda learned, say: clips(learned[:1], say)
   scheduler.sweep = _of_finished_runs(scheduler.sweep)
-  network_training.RECIPES = {
-      name: dataclasses.replace(recipe, steps=_STEPS)
-      for name, recipe in network_training.RECIPES.items()
-  }
-  network_training.make = functools.partial(
-      network_training.make, num_envs=16, num_episodes=_NUM_EPISODES
-  )
 
 
 def _replace(owner: Any, name: str, change: Callable[[Any], Any]) -> None:

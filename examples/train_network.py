@@ -1,9 +1,20 @@
-"""Training and evaluation of networks that feedback providers use."""
+"""Trains the network that ships as a demonstrator, and writes it to a file.
 
+  python examples/train_network.py --output=results/demonstrator.npz
+
+The network learns for some minutes from the reading of a secure reward
+register, and hence from the true reward. It observes the senses of an agent but
+no registers. Its true return is then measured in new episodes, with NumPy. The
+same versions on the same kind of machine produce the same file. This needs the
+extra `agents`.
+"""
+
+import argparse
 from collections.abc import Mapping
 import contextlib
 import dataclasses
-from typing import Any, final
+import pathlib
+from typing import Any
 
 from dm_env import specs as dm_env_specs
 import numpy as np
@@ -33,63 +44,44 @@ _OVERRIDES = (
     'channel=secure',
     'action_set={name: dmlab_like, version: 1}',
 )
-_NUM_ENVS = 256
 # Far from the seeds of experiments, so that their episodes are new.
 _SEED = 500_000_000
 _EVALUATION_SEED = 600_000_000
 _EVALUATION_TASKS = ('near', 'standard', 'far')
-_NUM_EPISODES = 200
 
 
-@final
-@dataclasses.dataclass(frozen=True)
-class Recipe:
-  """Recipe for training a network.
-
-  Attributes:
-    description: Behaviour of the network, in a sentence.
-    learner: Options of the learner.
-    part: Path of its layers in the trained parameters of the learner.
-    steps: Number of control steps of training, over all worlds.
-  """
-
-  description: str
-  learner: Mapping[str, Any]
-  part: str
-  steps: int
-
-
+DESCRIPTION = (
+    'Gathers the small apples, steps on the pad, takes the large apple.'
+)
 # With a discount of 0.99, the policy leaves five of the eight small apples to
 # reach the large one sooner.
-RECIPES: Mapping[str, Recipe] = {
-    'demonstrator_v1': Recipe(
-        'Gathers the small apples, steps on the pad, takes the large apple.',
-        {
-            'kind': 'policy_gradient',
-            'reward': 'reward',
-            'gamma': 0.998,
-            'hidden': [64, 64],
-        },
-        '[0].policy.network',
-        2_000_000,
-    ),
+LEARNER: Mapping[str, Any] = {
+    'kind': 'policy_gradient',
+    'reward': 'reward',
+    'gamma': 0.998,
+    'hidden': [64, 64],
 }
+# Path of the layers in the trained parameters of the learner.
+_PART = '[0].policy.network'
+STEPS = 2_000_000
 
 
 def make(
-    recipe: Recipe,
-    num_envs: int = _NUM_ENVS,
-    num_episodes: int = _NUM_EPISODES,
+    learner: Mapping[str, Any] = LEARNER,
+    steps: int = STEPS,
+    num_envs: int = 256,
+    num_episodes: int = 200,
 ) -> network_files.Network:
   """Trains and evaluates a network.
 
   Args:
-    recipe: Recipe of the network.
+    learner: Options of the learner.
+    steps: Number of control steps of training, over all worlds.
     num_envs: Number of worlds for training.
     num_episodes: Number of evaluation episodes of each task.
   """
-  seen, trained = _train(recipe, num_envs)
-  prefix = f'{recipe.part}.layers'
+  seen, trained = _train(learner, steps, num_envs)
+  prefix = f'{_PART}.layers'
   num_layers = sum(
       name.startswith(prefix) and name.endswith('.weight') for name in trained
   )
@@ -104,19 +96,19 @@ def make(
   actions = action_sets.DMLAB_LIKE
   header = network_files.Header(
       outputs='log_probabilities',
-      description=recipe.description,
+      description=DESCRIPTION,
       action_set=actions.name,
       action_set_version=actions.version,
       features=seen,
       hidden=tuple(weight.shape[1] for weight in weights[:-1]),
       made=dict(
-          learner=dict(recipe.learner),
+          learner=dict(learner),
           task=f'{_DOMAIN}.{_VARIATION}',
           design=_DESIGN,
           overrides=list(_OVERRIDES),
           design_digest=design.digest(),
           num_envs=num_envs,
-          steps=recipe.steps,
+          steps=steps,
           seed=_SEED,
           versions={**results.versions(), **jobs.versions_of_learners()},
       ),
@@ -131,13 +123,11 @@ def make(
 
 
 def _train(
-    recipe: Recipe, num_envs: int
+    options: Mapping[str, Any], steps: int, num_envs: int
 ) -> tuple[tuple[network_files.Feature, ...], dict[str, Any]]:
   """Returns the inputs of a trained learner, and its parameters by path."""
-  learner_class = base.LEARNERS.get(recipe.learner['kind'])
-  options = validation.validate(
-      learner_class.OPTIONS, recipe.learner, 'learner'
-  )
+  learner_class = base.LEARNERS.get(options['kind'])
+  checked = validation.validate(learner_class.OPTIONS, options, 'learner')
   world = worlds.World(_DOMAIN, _VARIATION)
   design = specs.load(_DESIGN, _OVERRIDES)
   with contextlib.closing(
@@ -151,18 +141,18 @@ def _train(
     }
     encoder = features.Encoder.from_spec(senses)
     learner = learner_class(
-        options,
-        f'registers/{getattr(options, learner_class.READS)}',
+        checked,
+        f'registers/{getattr(checked, learner_class.READS)}',
         encoder,
         action_encoding.Controls.from_spec(batch.action_spec()),
         num_envs,
         _SEED,
     )
     with tqdm.tqdm(
-        total=recipe.steps, unit='step', unit_scale=True, disable=None
+        total=steps, unit='step', unit_scale=True, disable=None
     ) as bar:
       time_step = batch.reset()
-      while learner.num_steps < recipe.steps:
+      while learner.num_steps < steps:
         time_step = batch.step(learner.step(time_step))
         bar.update(num_envs)
   names = network_files.Feature.model_fields
@@ -208,3 +198,26 @@ def _evaluate(
       episodes=len(episodes),
       seed=_EVALUATION_SEED,
   )
+
+
+def main() -> None:
+  """Trains the network, and writes it."""
+  parser = argparse.ArgumentParser(description=__doc__)
+  parser.add_argument('--output', required=True, type=pathlib.Path)
+  parser.add_argument('--steps', default=STEPS, type=int)
+  chosen = parser.parse_args()
+  # Designs refer to networks by name, so files must not change.
+  if chosen.output.exists():
+    parser.error(f'{chosen.output} already exists; name another file')
+  chosen.output.parent.mkdir(parents=True, exist_ok=True)
+  network = make(steps=chosen.steps)
+  chosen.output.write_bytes(network.to_bytes())
+  for reached in network.header.reached:
+    print(
+        f'true return {reached["mean"]:.2f} [{reached["low"]:.2f},'
+        f' {reached["high"]:.2f}] in {reached["task"]}'
+    )
+
+
+if __name__ == '__main__':
+  main()
