@@ -184,7 +184,8 @@ MUTANTS = [
     ),
     planting.Mutant(
         'contract', 'queries are not written', _CONTROL_STEP,
-        'list(mechanism.write_queries(view, queries))', '[]', _MECH,
+        '''  records += mechanism.write_queries(view, queries)
+''', '', _MECH,
     ),
     planting.Mutant(
         'contract', 'a provider that raises leaves the episode open',

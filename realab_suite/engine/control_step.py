@@ -74,7 +74,8 @@ def run(
   view = host.view(physics)
   was_over = host.is_over(physics)
   host.begin_step(physics, controls)
-  records = list(mechanism.write_queries(view, queries))
+  records: list[registers.Record] = []
+  records += mechanism.write_queries(view, queries)
 
   host.advance(physics, controls, schedule.meter_substep, is_last=False)
   is_ending = host.is_over(physics)
