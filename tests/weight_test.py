@@ -87,6 +87,6 @@ def test_no_room_is_above_its_budget(room):
 @pytest.mark.parametrize('room', sorted(_BUDGETS))
 def test_a_budget_is_lowered_when_its_room_shrinks(room):
   unused = _BUDGETS[room] - _WEIGHTS[room]
-  assert unused <= max(100, _SLACK * _BUDGETS[room]), (
-      f'{room}: {_WEIGHTS[room]:,.1f}; lower its budget in {_PAGE.name}'
-  )
+  assert unused <= max(
+      100, _SLACK * _BUDGETS[room]
+  ), f'{room}: {_WEIGHTS[room]:,.1f}; lower its budget in {_PAGE.name}'
