@@ -96,8 +96,8 @@ def test_each_port_is_a_register_of_the_design():
     [
         (
             {'learner': {'kind': 'policy_gradient', 'reward': 'told'}},
-            "'told' is not a register that agents read; allowed are"
-            " ['told_left', 'told_right']",
+            "'told' is not a register that agents read; did you mean"
+            " 'told_left'?; allowed are ['told_left', 'told_right']",
         ),
         (
             {

@@ -114,14 +114,13 @@ def test_a_closed_batch_does_nothing():
 
 
 class _Overflowing(collect_apples.CollectApples):
-  """Continues to earn after its end, what no meter can store."""
+  """Continues to earn after its end, beyond the range of its meter."""
 
   def latch_events(self, physics):
     """Nothing happens within a step."""
 
   def after_step(self, physics, random_state):
-    score = self.score(physics)
-    self.earn(physics, np.where(score < 4.0, 1.0, np.inf))
+    self.earn(physics, np.ones(np.shape(self.score(physics))))
 
   def should_terminate_episode(self, physics):
     length = 3.0 + (self.avatar.position(physics)[..., 0] > 0.0)
@@ -129,7 +128,9 @@ class _Overflowing(collect_apples.CollectApples):
 
 
 def test_a_world_that_is_over_does_no_harm_to_the_others():
-  design = helpers.one_register('score', role='meter', range=[0, 4])
+  design = helpers.one_register(
+      'score', role='meter', range=[0, 4], on_overflow='error'
+  )
   design['meters'] = [{'measures': 'score', 'writes': 'score'}]
   single = suite.embed(_Overflowing(), design, random=1, max_steps=50)
   batch = batch_environment.BatchEnvironment(single, 8)

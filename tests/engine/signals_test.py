@@ -24,15 +24,11 @@ _OPTIONS = {'role': 'signal', 'range': [0, 10], 'place': [1.4, -2.2]}
 
 @final
 class Alarm(providers.Provider):
-  """Writes a value from a step on, and is silent before.
-
-  From the step `last` on, it writes what no register stores.
-  """
+  """Writes a value from a step on, and is silent before."""
 
   kind: Literal['test_alarm'] = 'test_alarm'
   value: float = 5.0
   start: int = _ALARM_STEP
-  last: int = 1000
 
   def initial_state(self, batch_shape: tuple[int, ...]) -> np.ndarray:
     return np.zeros(batch_shape, int)
@@ -46,7 +42,7 @@ class Alarm(providers.Provider):
       state: np.ndarray,
   ) -> tuple[dict[str, Any], np.ndarray]:
     step = np.where(episode_start, 1, state + 1)
-    value = np.where(step < self.last, self.value, np.nan)
+    value = np.full(np.shape(step), self.value)
     return {name: (value, step >= self.start) for name in self.writes}, step
 
 
@@ -172,11 +168,11 @@ def test_providers_do_not_write_in_a_world_whose_episode_has_ended():
   design = _design()
   design['registers']['reward'] = {
       **design['registers']['stop'], 'role': 'feedback', 'place': [-2, 2],
-      'ends_episode': None,
+      'ends_episode': None, 'on_overflow': 'error',
   }  # fmt: skip
   # Step 4 of an episode would raise an exception.
   design['providers'].append(
-      {'kind': 'test_alarm', 'writes': ['reward'], 'start': 4, 'last': 4}
+      {'kind': 'test_alarm', 'writes': ['reward'], 'value': 99.0, 'start': 4}
   )
   env = _load(design, 3)
   _play(env, 2, 3)

@@ -7,7 +7,9 @@ from dm_control import mjcf
 import numpy as np
 import pytest
 
+from realab_suite import errors
 from realab_suite.engine import single_physics
+from realab_suite.entities import arenas
 from realab_suite.entities import registers
 from tests import worlds
 from tests.entities import register_worlds
@@ -29,6 +31,11 @@ def fixture_world(compiled):
   return compiled
 
 
+@pytest.fixture(scope='module', name='strict')
+def fixture_strict():
+  return register_worlds.make_world(on_overflow='error')
+
+
 def _shove_everything(world, random_state, register):
   """Pushes, lifts and turns every block of a register, at random."""
   for block in register.blocks:
@@ -41,6 +48,68 @@ def _shove_everything(world, random_state, register):
 
 
 # ---- Writing and reading -----------------------------------------------------
+
+
+@register_worlds.every_variety
+def test_a_register_that_does_not_saturate_refuses_more_than_its_bounds(
+    strict, variety
+):
+  strict.restart()
+  register = strict.registers[variety.name]
+  before = worlds.state_bytes(strict.physics)
+  for value in (np.nextafter(register_worlds.HIGH, 9), -40.0):
+    with pytest.raises(
+        errors.RegisterValueError,
+        match=rf'{variety.name}.* {value}.*\[-2.0, 5.0\]',
+    ):
+      register.write(strict.physics, value)
+  assert worlds.state_bytes(strict.physics) == before
+  for bound in (register_worlds.LOW, register_worlds.HIGH):
+    assert register.write(strict.physics, bound) == bound
+
+
+@pytest.mark.parametrize(('value', 'bound'), [(0.0, 1.0), (1.5, 1.5), (4, 3)])
+def test_a_range_without_zero_is_saturated_at_the_nearest_bound(value, bound):
+  arena = arenas.OpenRoom()
+  register = registers.TwoBlockRegister(
+      'positive', value_range=(1.0, 3.0), initial=2.0
+  )
+  register.attach_to(arena, (0.0, 0.0))
+  physics = worlds.compile_world(arena)
+  worlds.start_episode(physics, register)
+  assert register.write(physics, value) == bound
+
+
+def test_a_write_to_one_register_is_no_write_to_another(world):
+  values = {}
+  random_state = np.random.RandomState(0)
+  for name, register in world.registers.items():
+    values[name] = random_state.uniform(
+        register_worlds.LOW, register_worlds.HIGH
+    )
+    register.write(world.physics, values[name])
+  for name, register in world.registers.items():
+    assert register.read(world.physics) == pytest.approx(
+        values[name], abs=register_worlds.ROUNDING
+    )
+
+
+# ---- What happens to a value -------------------------------------------------
+
+
+def test_values_do_not_drift_without_tampering(world):
+  values = [0.0, *np.linspace(register_worlds.LOW, register_worlds.HIGH, 9)]
+  worst = dict.fromkeys(world.registers, 0.0)
+  for value in values:
+    for register in world.registers.values():
+      register.write(world.physics, value)
+    worlds.step(world.physics, 200)
+    for name, register in world.registers.items():
+      corruption = register.inspect(world.physics)
+      error = np.abs(register.read(world.physics) - value)
+      moved = np.abs(corruption.permanent) * register_worlds.SCALE
+      worst[name] = max(worst[name], error, moved)
+  assert {name: error for name, error in worst.items() if error > 1e-9} == {}
 
 
 @register_worlds.every_variety

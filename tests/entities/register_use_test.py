@@ -115,6 +115,7 @@ def test_an_avatar_moves_blocks_that_are_not_welded(variety):
     [
         ('channel', 'secured'),
         ('dof', 'fixed'),
+        ('on_overflow', 'clip'),
         ('role', 'reward'),
         ('value_range', (1.0, 1.0)),
         ('value_range', (0.0, np.nan)),

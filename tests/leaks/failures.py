@@ -82,6 +82,7 @@ _FAILURES: dict[str, Callable[[np.ndarray], Any]] = {
     'returns another key': lambda value: {f'score_{secrets.CANARY}': value},
     'returns another shape': lambda v: {'reward': np.full(7, secrets.CANARY)},
     'returns no number': lambda value: {'reward': value * np.nan},
+    'returns too much': lambda value: {'reward': value * secrets.CANARY},
 }
 
 
@@ -189,6 +190,12 @@ def provoke_providers(num_envs: int, seed: int) -> Iterator[Provoked]:
     for how in _FAILURES:
       design = {
           **secrets.NO_METERS,
+          'registers': {
+              'reward': {
+                  **secrets.NO_METERS['registers']['reward'],
+                  'on_overflow': 'error',
+              }
+          },
           'providers': [
               {'kind': 'leaks_failing', 'how': how, 'writes': ['reward']}
           ],

@@ -106,6 +106,7 @@ class Register(modelled.ModelledEntity):
     self._role = arguments.role
     self._channel = arguments.channel or 'embedded'
     self._dof = arguments.dof or 'free'
+    self._on_overflow = arguments.on_overflow
     self._write = arguments.write
     self._block_size = arguments.block_size
     self._mass = arguments.mass
@@ -490,7 +491,8 @@ class Register(modelled.ModelledEntity):
       shape: Shape of the value.
 
     Raises:
-      RegisterValueError: If it is not finite.
+      RegisterValueError: If it is not finite, or out of the range of a register
+        that does not saturate.
     """
     try:
       value = np.asarray(measure(physics), np.float64)
@@ -546,8 +548,9 @@ class Register(modelled.ModelledEntity):
       saturation, never corruption.
 
     Raises:
-      RegisterValueError: If a value is not finite or has a wrong shape. Nothing
-        is written.
+      RegisterValueError: If a value is not finite or has a wrong shape, or if
+        it is out of range and the register does not saturate. Nothing is
+        written.
     """
     value = np.asarray(value, np.float64)[()]
     if self.PORTS and value.shape[-1:] != self._shape:
@@ -590,12 +593,20 @@ class Register(modelled.ModelledEntity):
     """Returns the values, saturated to the range of the register.
 
     Raises:
-      RegisterValueError: If a value is not finite.
+      RegisterValueError: If the register refuses a value.
     """
     is_finite = np.isfinite(value)
     if not is_finite.all():
       raise checks.refusal(
           self._name, value, ~is_finite, 'allowed are finite values', self.PORTS
+      )
+    if self._on_overflow == 'error':
+      raise checks.refusal(
+          self._name,
+          value,
+          ~fits,
+          f'its range is [{self._low}, {self._high}]',
+          self.PORTS,
       )
     return np.where(fits, value, np.clip(value, self._low, self._high))[()]
 
