@@ -191,7 +191,7 @@ def test_blocks_of_a_secure_register_are_seen_as_scenery():
 
 _CANNOT = 'cannot be measured in this world; allowed are ['
 _MISFITS = {
-    'of: [rewards]': f"of: 'rewards' {_CANNOT}'reward', 'score']",
+    'of: [rewards]': "of: 'rewards' cannot be measured in this world; did you",
     # What is no register has no place that a write has given it.
     'of: [reward, avatar]': f"of: 'avatar' {_CANNOT}'reward', 'score']",
     'of: [reward], sight: {eye: guard}':
