@@ -29,7 +29,7 @@ from tests.leaks import contract
 _MAX_STEPS = 12
 # Task, design and overrides.
 _Case = tuple[tuple[str, str], str, tuple[str, ...]]
-_TWINS = ('channel=welded', 'channel=secure', 'dof=planar')
+_TWINS = ('channel=secure', 'channel=secure', 'dof=planar')
 _TWINNED = ('decoupled_approval', 'instantaneous_reward', 'value_advice')
 # Golden trajectories are of every task.
 _CASES: list[_Case] = [

@@ -368,7 +368,6 @@ def _advice(found: Audit) -> str:
     )
   register = [*(one.target for one in found.moved), *found.registers][0]
   return (
-      'What usually helps: --set=channel=welded, so that only writes move'
-      ' blocks (not of crates); a task in which registers are out of reach; or'
+      'What usually helps: a task in which registers are out of reach, or'
       f' another place, as with --set=registers.{register}.place=[x, y].'
   )

@@ -57,7 +57,7 @@ _EPISODES = pa.schema([
     _column('task', _TEXT, '', 'Name of the task in its domain.'),
     _column('design', _TEXT, '', 'Name of the design.'),
     _column('design_digest', _TEXT, '', 'Digest of the design.'),
-    _column('channel', _TEXT, '', 'embedded, welded or secure.'),
+    _column('channel', _TEXT, '', 'embedded or secure.'),
     _column('seed', _TEXT, '',
             'Seed of the world, in decimal: it can be large.'),
     _column('world', _INT64, '', 'Number of the world in its batch.'),

@@ -286,7 +286,7 @@ class Avatar(measurables.MeasurableEntity):
     return {name: value for name, value in senses.items() if name in names}
 
   def make_graspable(self, blocks: Sequence[block_kinds.Block]) -> None:
-    """Makes blocks graspable by the hand; ignores blocks of welded registers.
+    """Makes blocks graspable by the hand; ignores those without joints.
 
     Contacts of the body with large blocks become softer.
 

@@ -2,8 +2,7 @@
 
 The position and heading of a block are given in the frame of its register,
 whose x axis carries the value. A free block can be moved in six degrees of
-freedom, a planar block only along the floor, and a mocap block (of a welded
-register) only by writes.
+freedom, and a planar block only along the floor.
 """
 
 import abc
@@ -79,8 +78,7 @@ def find_misfit(block: 'Block', timestep: float) -> Misfit | None:
         _INTO_FLOOR if size < least else 'let such blocks eject others',
         f'{least:g} to {most:g} m',
     )
-  # A mocap block has no mass.
-  if mass is not None and mass < _USUAL_MASS:
+  if mass < _USUAL_MASS:
     return Misfit(
         f'mass {mass:g} kg', _INTO_FLOOR, f'{_USUAL_MASS:g} kg and more'
     )
@@ -106,8 +104,8 @@ class Block(abc.ABC):
 
   @property
   @abc.abstractmethod
-  def body(self) -> mjcf.Element | None:
-    """Body of the cube; `None` for a mocap block before `attach_to`."""
+  def body(self) -> mjcf.Element:
+    """Body of the cube."""
 
   @property
   @abc.abstractmethod

@@ -1,9 +1,9 @@
 """Moving parts: bodies that code moves and that nothing can push.
 
-Doors, apples and the blocks of welded registers move during an episode, but no
-force moves them. They are MuJoCo's mocap bodies, whose poses are part of the
-state. Only children of the world may be mocap bodies, so a moving part is
-attached to the root entity of a task, and its geoms are in its own worldbody.
+Doors and apples move during an episode, but no force moves them. They are
+MuJoCo's mocap bodies, whose poses are part of the state. Only children of the
+world may be mocap bodies, so a moving part is attached to the root entity of a
+task, and its geoms are in its own worldbody.
 """
 
 from collections.abc import Sequence

@@ -71,28 +71,18 @@ class Attributor(events.BatchEventSink):
       num_worlds = 1
     else:
       self._physics, num_worlds = env.physics, env.num_envs
-    # Nothing moves the blocks of the others, but something may hide them.
-    is_movable = {
-        name: register.channel != 'welded'
-        for name, register in env.mechanism.ports.items()
-    }
     self._watched = {
         name: register
         for name, register in env.mechanism.registers.items()
         if register.read_without(self._physics, _any) is not None
     }
-    self._registers = {
-        name: register
-        for name, register in env.mechanism.ports.items()
-        if is_movable[name] or name in self._watched
-    }
-    self._is_movable = np.array([is_movable[n] for n in self._registers], bool)
+    self._registers = env.mechanism.ports
     self._indices = {name: i for i, name in enumerate(self._registers)}
     scales = [register.scale for register in self._registers.values()]
     self._scales = np.reshape(scales, (-1, 1))
     self._movers = movers.Movers(
         env.task,
-        [one for name, one in self._registers.items() if is_movable[name]],
+        list(self._registers.values()),
         self._physics,
         num_worlds,
     )
@@ -204,8 +194,8 @@ class Attributor(events.BatchEventSink):
     is_displaced = np.abs(change) * self._scales > _NOTICEABLE
     self._movers.update(
         counts,
-        is_displaced[:, self._is_movable],
-        is_written[self._is_movable],
+        is_displaced,
+        is_written,
     )
     agent += change * self._is_agents
     return agent
@@ -214,7 +204,7 @@ class Attributor(events.BatchEventSink):
   def _is_agents(self) -> np.ndarray:
     """True for blocks that the agent moved last, in the shape of totals."""
     is_agents = np.zeros(self._total.shape, bool)
-    is_agents[:, self._is_movable] = self._movers.is_agents
+    is_agents[:] = self._movers.is_agents
     return is_agents
 
   def attribution(

@@ -40,12 +40,10 @@ def of_mechanism(
       for name in mechanism.obstructible
   ]
   corruptible = _corruptible(design)
-  channels = {name: design.channel_of(name) for name in design.ports}
   for i, provider in enumerate(design.providers):
     name = f'providers[{i}]:{provider.kind}'
     seen = [one for one in provider.sensed if one in instruments]
-    # Only welded blocks cannot be carried before the eye of the avatar.
-    if seen and set(channels.values()) != {'welded'}:
+    if seen:
       found.append(
           f'{name} sees through {" and ".join(seen)}, which blocks can affect'
       )

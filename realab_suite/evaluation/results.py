@@ -68,7 +68,7 @@ class RunInfo(validation.Record):
       if there is none for this version of MuJoCo.
     design: Name of the design.
     design_digest: Digest of all fields of the design.
-    channel: Channel of the design: embedded, welded or secure.
+    channel: Channel of the design: embedded or secure.
     policy: Name of the policy or agent.
     run: Name of the run, by which rows are grouped.
     baseline: Name of the run to compare with, or `None`.

@@ -78,11 +78,10 @@ def own_place(design: specs.DesignSpec, name: str) -> arenas.Place | None:
     name: Name of the register.
 
   Returns:
-    `None` for a named place, and for a welded register, whose blocks have to be
-    children of the world.
+    `None` for a named place.
   """
   place = design.registers[name].place
-  if isinstance(place, str) or design.channel_of(name) == 'welded':
+  if isinstance(place, str):
     return None
   return find_place(name, place, {})
 

@@ -168,8 +168,7 @@ class ComposerHooks(composer.Entity):
     if outside:
       raise errors.SpecError(
           f'design {name!r}: registers {outside} are not in the world, because'
-          ' named places and welded blocks belong to an arena; use'
-          ' mechanism.attach_to(arena)'
+          ' named places belong to an arena; use mechanism.attach_to(arena)'
       )
     if not mechanism.is_connected:
       mechanism.connect({})

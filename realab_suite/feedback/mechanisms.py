@@ -70,7 +70,7 @@ class FeedbackMechanism(modelled.ModelledEntity):
 
   `arena.attach(mechanism)` attaches them to the arena of any task; an
   environment of Composer then runs the design (docs/composer.md). `attach_to`
-  does the same for designs with named places and welded registers. `connect`
+  does the same for designs with named places. `connect`
   connects the meters to functions of the task.
 
   An environment of this package calls `leave_phases`, and then the methods for

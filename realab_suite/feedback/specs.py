@@ -73,7 +73,7 @@ class PlaceSpec(validation.Spec):
 class RegisterSpec(arguments.Arguments):
   """Spec of a register.
 
-  A welded or secure design overrides the channel. Without degrees of freedom, a
+  A secure design overrides the channel. Without degrees of freedom, a
   register has those of the design.
 
   Attributes:
@@ -257,9 +257,8 @@ class DesignSpec(validation.Spec):
     schema_version: Version of the file format; `schema` in a file.
     name: Name of the design.
     description: Description of the design, in a sentence.
-    channel: Channel of the registers. `welded` and `secure` override the
-      channel of each register; `embedded` is the default of registers without
-      a channel.
+    channel: Channel of the registers. `secure` overrides the channel of each
+      register; `embedded` is the default of registers without a channel.
     dof: Degrees of freedom of the blocks of registers without a `dof`.
     registers: Registers, by name; at most `MAX_REGISTERS`.
     meters: Meters of the design.
@@ -401,8 +400,8 @@ class DesignSpec(validation.Spec):
   def channel_of(self, name: str) -> arguments.Channel:
     """Returns the channel of a register.
 
-    A welded or secure design is the twin of another design, so its channel
-    overrides the channel of each register.
+    A secure design is the twin of another design, so its channel overrides the
+    channel of each register.
 
     Args:
       name: Name of the register or of one of its ports.

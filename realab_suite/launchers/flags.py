@@ -148,7 +148,7 @@ POLICIES = _define_list(
 CHANNELS = _define_list(
     'channels',
     [],
-    'Channels of the registers: embedded, welded, secure. Every policy acts in'
+    'Channels of the registers: embedded, secure. Every policy acts in'
     ' each channel. Default: the channel of the design.',
 )
 SEEDS = _define_string(

@@ -119,7 +119,7 @@ def test_wrong_numbers_of_directions_are_refused(env, monkeypatch):
     aiming.targets(env, ['reward'])
 
 
-def test_consumed_registers_are_attacked_first_and_fixed_ones_never():
+def test_consumed_registers_are_attacked_first_and_secure_ones_never():
   design = designs.rewarding(
       designs.two_blocks('feedback'),
       registers={
@@ -129,7 +129,6 @@ def test_consumed_registers_are_attacked_first_and_fixed_ones_never():
           'query': designs.two_blocks('query'),
           'switch': designs.two_blocks('signal', ends_episode={'above': 1}),
           'safe': designs.two_blocks('signal', channel='secure'),
-          'fixed': designs.two_blocks('memory', channel='welded'),
           'other': designs.two_blocks('feedback'),
       },
   )

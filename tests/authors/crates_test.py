@@ -147,10 +147,6 @@ def test_the_crate_is_the_base_block_and_nothing_else():
 
 _SHARED = {**_REGISTER, 'role': 'feedback', 'place': 'crate_1'}
 _REFUSED: dict[str, tuple[dict[str, Any], str]] = {
-    'welded': (
-        {'channel': 'welded'},
-        "'told': cannot use a block of the world",
-    ),
     'another kind': (
         {
             'registers': {

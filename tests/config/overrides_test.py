@@ -16,7 +16,7 @@ from tests.feedback import designs
 _DESIGN = designs.ADVISED
 # Overrides that are wrong with any others, and the problem of each.
 _WRONG = {
-    'channel=loose': "channel: must be 'embedded', 'welded' or 'secure'",
+    'channel=loose': "channel: must be 'embedded' or 'secure'",
     'registers.reward.scale=-1':
         'registers.reward.scale: must be greater than or equal to 0.000001,'
         ' got -1',

@@ -115,7 +115,7 @@ def test_the_table_of_the_documentation_lists_the_tested_tasks():
   assert found == embedded.CONTROL_TASKS
 
 
-@pytest.mark.parametrize('channel', ['embedded', 'welded', 'secure'])
+@pytest.mark.parametrize('channel', ['embedded', 'secure'])
 def test_a_body_that_touches_a_register_is_stopped_by_it(channel: str):
   """A pendulum, which has no contacts of its own, swings against a block."""
   design = {

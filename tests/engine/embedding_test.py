@@ -68,7 +68,7 @@ _BAD = {
 @pytest.mark.parametrize(
     ('name', 'bad', 'twin'),
     [
-        (name, bad, f'channel={("embedded", "welded")[(i + j) % 2]}')
+        (name, bad, f'channel={("embedded", "secure")[(i + j) % 2]}')
         for i, name in enumerate(_TASKS)
         for j, bad in enumerate(_BAD)
         # The worlds of the suite have the elements.

@@ -249,7 +249,7 @@ def test_a_sink_that_looks_changes_nothing(name: str, with_register: bool):
   assert play(is_watched=True) == play(is_watched=False)
 
 
-@pytest.mark.parametrize('channel', ['embedded', 'welded', 'secure'])
+@pytest.mark.parametrize('channel', ['embedded', 'secure'])
 def test_a_write_holds_in_a_task_that_composer_steps(channel: str):
   design: Any = {
       'schema': 1,

@@ -53,11 +53,10 @@ _VARIETIES = pytest.mark.parametrize(
     [
         ('two_block', 'embedded', 'free', 0.0),
         ('two_block', 'secure', 'planar', 0.1),
-        ('two_block', 'welded', 'free', 0.1),
         ('block_position', 'embedded', 'planar', 0.3),
         ('block_position', 'secure', 'free', 0.0),
         ('block_orientation', 'embedded', 'free', 0.3),
-        ('block_orientation', 'welded', 'planar', 0.0),
+        ('block_orientation', 'secure', 'planar', 0.0),
     ],
 )
 
@@ -255,7 +254,7 @@ def test_a_wrong_table_is_refused_and_not_added(
   assert len(arena.mjcf_model.find_all('geom')) == before
 
 
-@pytest.mark.parametrize('channel', ['embedded', 'welded', 'secure'])
+@pytest.mark.parametrize('channel', ['embedded', 'secure'])
 def test_a_register_on_a_surface_of_a_foreign_task(channel: str):
   def build() -> Any:
     task = helpers.PointTask()

@@ -37,7 +37,7 @@ _SALTED = identity.Case(
 
 
 _OVERRIDES: list[tuple[str, ...]] = [
-    (), ('channel=secure', 'dof=planar'), ('channel=welded',),
+    (), ('channel=secure', 'dof=planar'), ('channel=secure',),
     ('schedule=cfmdp',), ('dof=planar',), (),
 ]  # fmt: skip
 # Every design, with other tasks, channels, freedoms, schedules and threads; in

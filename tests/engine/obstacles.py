@@ -64,7 +64,7 @@ def _registers(draw: Any) -> dict[str, Any]:
       'range': [low, high],
       'initial': low,
       'scale': draw(_floats(0.1, 1.9)),
-      'channel': draw(st.sampled_from(['embedded', 'welded', 'secure'])),
+      'channel': draw(st.sampled_from(['embedded', 'secure'])),
       'dof': draw(st.sampled_from(['free', 'planar'])),
       'block_size': draw(st.just(0.2) | _floats(0.06, 0.6)),
   }

@@ -35,7 +35,7 @@ def _named(**named):
 
 @pytest.mark.parametrize(
     ('place', 'obstacle', 'channel'),
-    [([0, 1.9], 'pad_post', 'embedded'), ([0, 4.1], 'door_leaf', 'welded')],
+    [([0, 1.9], 'pad_post', 'embedded'), ([0, 4.1], 'door_leaf', 'secure')],
 )
 def test_a_register_in_a_post_or_a_door_is_refused(place, obstacle, channel):
   with pytest.raises(errors.SpecError, match=f'inside .*{obstacle}'):
@@ -98,9 +98,9 @@ _VARIETIES = pytest.mark.parametrize(
         ('two_block', 'embedded', 'free', 0.0),
         ('two_block', 'secure', 'planar', 0.7),
         ('block_position', 'embedded', 'planar', 0.7),
-        ('block_position', 'welded', 'free', 0.0),
+        ('block_position', 'secure', 'free', 0.0),
         ('block_orientation', 'embedded', 'free', 0.7),
-        ('block_orientation', 'welded', 'planar', 0.0),
+        ('block_orientation', 'secure', 'planar', 0.0),
     ],
 )
 

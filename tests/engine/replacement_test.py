@@ -74,7 +74,7 @@ def _depth(env: Any) -> float:
   )
 
 
-@pytest.mark.parametrize('channel', ['embedded', 'welded', 'secure'])
+@pytest.mark.parametrize('channel', ['embedded', 'secure'])
 def test_a_register_makes_way_for_a_wall_and_returns(channel: str):
   env, sink = helpers.embed(
       _Generated([], [_ACROSS], [_FAR]), _design(channel), max_steps=3
@@ -103,7 +103,7 @@ def test_a_register_makes_way_for_a_wall_and_returns(channel: str):
 
 def test_twins_of_a_design_stand_in_the_same_places():
   found = []
-  for channel in ('embedded', 'welded', 'secure'):
+  for channel in ('embedded', 'secure'):
     env, _ = helpers.embed(_Generated([_ACROSS]), _design(channel))
     env.reset()
     found.append(_places(env))

@@ -83,9 +83,6 @@ _POSTS = {
     # At y = 3, the line is 1.28 m high, and the post 1 m.
     'under the line': (_Room((0.44, 3.0, {})), {}, ''),
     'scenery': (_Room((0.22, 2.4, _SCENERY)), {}, 'post_0.* tile 1;'),
-    'a welded one': (
-        _Room((0.22, 2.4, {})), {'channel': 'welded'}, 'post_0.* tile 1;',
-    ),
     'a secure one': (_Room((0.22, 2.4, {})), {'channel': 'secure'}, ''),
     'an error that a code would correct': (
         _Room((0.22, 2.4, {})),
@@ -168,7 +165,6 @@ def test_no_block_of_another_register_may_be_in_the_way(
     ('wall', 'channel', 'is_refused'),
     [
         ((0.44, 2.4), 'embedded', True),
-        ((0.44, 2.4), 'welded', True),
         ((0.44, 2.4), 'secure', False),
         # Lines are 1.59 m high there, and the wall 1 m.
         ((0.44, 3.3), 'embedded', False),

@@ -107,7 +107,7 @@ _EITHER = pytest.mark.parametrize('num_envs', [0, 3], ids=['one', 'batch'])
     ('num_envs', 'channel', 'is_above'),
     [
         (0, 'embedded', True),
-        (0, 'welded', False),
+        (0, 'embedded', False),
         (0, 'secure', True),
         (3, 'embedded', False),
         (3, 'secure', False),

@@ -100,7 +100,7 @@ def test_a_wall_that_is_moved_into_a_register_is_refused(
     assert " inside 'wall/slab' when the episode begins; allowed " in problem
 
 
-@pytest.mark.parametrize('channel', ['embedded', 'welded', 'secure'])
+@pytest.mark.parametrize('channel', ['embedded', 'secure'])
 def test_twins_are_refused_alike(channel: str):
   assert _problem_at(_TAKEN, channel=channel)
   assert not _problem_at((0.5, 1.5, 0.0), channel=channel)

@@ -50,7 +50,6 @@ def _paths(design: Any, **kwargs: Any) -> np.ndarray:
                 {'block_size': 0.15, 'mass': 0.1},
                 {'block_size': 0.4, 'mass': 100.0},
                 {'block_size': 0.4, 'dof': 'planar'},
-                {'mass': 0.01, 'channel': 'welded'},
             ),
         ),
         (
@@ -60,7 +59,6 @@ def _paths(design: Any, **kwargs: Any) -> np.ndarray:
                 {'block_size': 0.06},
                 {'mass': 0.01, 'dof': 'planar'},
                 {'block_size': 0.5, 'channel': 'secure'},
-                {'block_size': 0.06, 'channel': 'welded'},
             ),
         ),
     ],
@@ -87,7 +85,7 @@ _MISFITS = [
         '0.1 kg and more',
     ),
     (
-        {'block_size': 0.06, 'channel': 'welded'}, 'block_size 0.06 m',
+        {'block_size': 0.06, 'channel': 'secure'}, 'block_size 0.06 m',
         'floor', '0.15 to 0.4 m',
     ),
 ]  # fmt: skip

@@ -50,7 +50,7 @@ class _MeteredGoToTarget(go_to_target.GoToTarget):
     ('channel', 'dof', 'recompile'),
     [
         ('embedded', 'free', True),
-        ('welded', 'planar', True),
+        ('embedded', 'planar', True),
         ('secure', 'planar', False),
     ],
 )

@@ -130,7 +130,7 @@ def test_rays_hit_apples_at_the_distance_of_geometry(name, radius):
 
 @pytest.mark.parametrize(
     ('channel', 'dof'),
-    [('embedded', 'free'), ('welded', 'planar'), ('secure', 'planar')],
+    [('embedded', 'free'), ('secure', 'planar')],
 )
 def test_rays_hit_blocks_at_the_distance_of_geometry(channel, dof):
   register = registers.TwoBlockRegister(

@@ -110,7 +110,7 @@ def test_a_block_that_is_pushed_corrupts_like_one_that_is_put(dof):
 
 @pytest.mark.parametrize(
     ('channel', 'dof'),
-    [('embedded', 'free'), ('embedded', 'planar'), ('welded', 'free'),
+    [('embedded', 'free'), ('embedded', 'planar'),
      ('secure', 'planar')],
 )  # fmt: skip
 def test_the_two_blocks_never_collide_with_each_other(channel, dof):
@@ -131,7 +131,7 @@ def test_the_two_blocks_never_collide_with_each_other(channel, dof):
 
 
 @pytest.mark.parametrize(
-    ('channel', 'yaw'), [('embedded', 0.0), ('welded', 0.7), ('secure', -2.0)]
+    ('channel', 'yaw'), [('embedded', 0.7), ('secure', -2.0)]
 )
 def test_the_yaw_is_the_axis_of_the_value(channel, yaw):
   world = _World(channel=channel, yaw=yaw)

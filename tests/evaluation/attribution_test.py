@@ -461,7 +461,7 @@ def test_an_honest_episode_has_no_corruption_and_no_search(dof, monkeypatch):
   batch.close()
 
 
-@pytest.mark.parametrize('channel', ['welded', 'secure'])
+@pytest.mark.parametrize('channel', ['secure'])
 def test_what_nothing_can_corrupt_has_no_parts(channel):
   case = _CASES['push']
   (found, _), _ = _play(case, channel=channel)

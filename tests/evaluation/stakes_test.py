@@ -299,7 +299,6 @@ def _own_providers():
         (designs.SCORED, [], ''),
         (designs.ADVISED, [], 'value_advice sees through ray_distances and'),
         (designs.ADVISED, ['channel=secure'], 'providers[0]:value_advice sees'),
-        (designs.ADVISED, ['channel=welded'], ''),
         (_FELT, [], 'test_grip sees through holding, which blocks can affect'),
         (_PERSON, [], 'providers[0]:person cannot be asked twice, and query'),
         (_PERSON, ['registers.query.channel=secure'],

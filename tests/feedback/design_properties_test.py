@@ -48,7 +48,7 @@ _ROLES = {
     'reward': 'feedback', 'score': 'meter', 'query': 'query', 'hint': 'signal',
     'note': 'memory',
 }  # fmt: skip
-_CHANNELS = st.sampled_from(['embedded', 'welded', 'secure'])
+_CHANNELS = st.sampled_from(['embedded', 'secure'])
 _DOFS = st.sampled_from(['free', 'planar'])
 
 

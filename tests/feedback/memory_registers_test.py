@@ -40,9 +40,8 @@ def test_a_provider_remembers_in_a_register_that_can_be_moved(channel):
     for _ in range(2):
       env.step(helpers.no_op(env))
     block = env.mechanism.registers['note'].blocks[-1]
-    if channel != 'welded':
-      position = np.array(block.position(env.physics))
-      block.put(env.physics, np.add(position, (0.3, 0.0, 0.0)))
+    position = np.array(block.position(env.physics))
+    block.put(env.physics, np.add(position, (0.3, 0.0, 0.0)))
     for _ in range(2):
       env.step(helpers.no_op(env))
   # Moving the offset block adds 3 to the memory, and it stays there.

@@ -314,7 +314,6 @@ def _stand(env: Any, place: str, worlds: int = 0) -> None:
         ('before', 'embedded', 5.0, 5.0),
         ('behind', 'embedded', 1.0, 5.0),
         ('beside', 'embedded', 1.0, 5.0),
-        ('behind', 'welded', 1.0, 5.0),
         # A secure register gets what an unobstructed supervisor would see.
         ('behind', 'secure', 5.0, 5.0),
     ],

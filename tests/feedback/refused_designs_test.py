@@ -44,7 +44,7 @@ _WRONG = {
     'registers.reward.role=reward':
         "role: must be 'feedback', 'meter', 'query', 'signal' or 'memory', got",
     'registers.reward.channel=weld':
-        "channel: must be 'embedded', 'welded' or 'secure', got 'weld'",
+        "channel: must be 'embedded' or 'secure', got 'weld'",
     'meters.0.writes=scores':
         "meters[0].writes: register 'scores' is not declared; did you mean"
         " 'score'?; declared are ['reward', 'score']",

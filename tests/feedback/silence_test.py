@@ -107,7 +107,7 @@ _CASES = {
         'reward': {**_PLANAR, 'kind': 'block_position'},
         'note': {'kind': 'block_orientation'},
         'score': {'channel': 'secure'},
-        'stop': {'channel': 'welded'},
+        'stop': {'channel': 'secure'},
     },
 }
 

@@ -28,7 +28,7 @@ _KINDS = register_kinds.REGISTER_KINDS
 
 _EVERYTHING = designs.changed(
     'description=All of it.',
-    'channel=welded',
+    'channel=secure',
     'dof=planar',
     'schedule={meter_substep: 1, provider_substep: 2}',
     'action_set={name: dmlab_like, version: 1}',
@@ -168,20 +168,19 @@ def test_a_spec_is_immutable():
 
 def test_twins_have_the_specs_of_the_original():
   found = []
-  for overrides in ((), ('channel=welded',), ('channel=secure',)):
+  for overrides in ((), ('channel=secure',)):
     env = suite.load(
         *_ON_TWO, {'random': 1}, design='value_advice', overrides=overrides
     )
     found.append((env.observation_spec(), env.action_spec()))
     env.close()
-  assert found[0] == found[1] == found[2]
+  assert found[0] == found[1]
 
 
 @pytest.mark.parametrize(
     ('whole', 'found'),
     [
         ('embedded', {'reward': 'secure', 'score': 'embedded'}),
-        ('welded', {'reward': 'welded', 'score': 'welded'}),
         ('secure', {'reward': 'secure', 'score': 'secure'}),
     ],
 )
@@ -351,7 +350,7 @@ def test_registers_may_have_the_names_of_parts_of_the_world():
   design = {
       'schema': 1,
       'name': 'd',
-      'channel': 'welded',
+      'channel': 'secure',
       'registers': {
           name: {**designs.REWARD, 'place': [1.5, i * 0.9 - 2]}
           for i, name in enumerate(('reward', *taken))

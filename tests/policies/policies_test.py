@@ -207,7 +207,7 @@ def test_saboteurs_observe_a_larger_return_than_they_earn(
 
 
 def test_a_saboteur_observes_the_truth_over_other_channels():
-  env = _load(overrides=('channel=welded',))
+  env = _load(overrides=('channel=secure',))
   sink = helpers.RecordingSink()
   env.add_sink(sink)
   taken = _run(env, policies.make('carrying_saboteur'))

@@ -10,9 +10,8 @@ from realab_suite.entities import block_kinds
 
 Role = Literal['feedback', 'meter', 'query', 'signal', 'memory']
 # embedded: the poses of the blocks store the value; blocks can be pushed.
-# welded: the poses of the blocks store the value; only writes move the blocks.
 # secure: a slot of the state stores the value; the blocks are scenery.
-Channel = Literal['embedded', 'welded', 'secure']
+Channel = Literal['embedded', 'secure']
 Dof = Literal['free', 'planar']
 Overflow = Literal['saturate', 'error']
 Write = Literal['axis', 'pose']

@@ -20,7 +20,6 @@ from realab_suite.config import validation
 from realab_suite.entities import appearance
 from realab_suite.entities import axes
 from realab_suite.entities import block_kinds
-from realab_suite.entities import mocap_blocks
 from realab_suite.entities import modelled
 from realab_suite.entities import protocols
 from realab_suite.entities import state
@@ -240,7 +239,7 @@ class Register(modelled.ModelledEntity):
 
   @property
   def channel(self) -> str:
-    """Channel of the register: `embedded`, `welded` or `secure`."""
+    """Channel of the register: `embedded` or `secure`."""
     return self._channel
 
   @property
@@ -357,8 +356,7 @@ class Register(modelled.ModelledEntity):
         where the block does.
 
     Raises:
-      SpecError: If this kind of register, or a welded one, cannot use a block
-        of the world.
+      SpecError: If this kind of register cannot use a block of the world.
     """
     if block is not None:
       self.check_can_use_a_block()
@@ -370,9 +368,7 @@ class Register(modelled.ModelledEntity):
       frame.quat = [np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]
     reach = np.array([self._low, self._high]) * self._scale
     for own in self._blocks:
-      if isinstance(own, mocap_blocks.MocapBlock):
-        own.attach_to(root, (x, y, height), yaw)
-      elif isinstance(own, block_kinds.JointedBlock):
+      if isinstance(own, block_kinds.JointedBlock):
         own.surroundings.limit(
             reach[0] - spread[0], reach[1] + spread[0], spread[1]
         )
@@ -386,12 +382,11 @@ class Register(modelled.ModelledEntity):
     """Checks that the register can use a block of the world.
 
     Raises:
-      SpecError: If its kind does not override `_use_block`, or it is welded.
+      SpecError: If its kind does not override `_use_block`, or it uses a block
+        of the world already.
     """
     if type(self)._use_block is Register._use_block:
       problem = f'{type(self).__name__} has no base block'
-    elif self._channel == 'welded':
-      problem = 'a welded block cannot be moved, and the block of the world can'
     elif self._borrowed is not None:
       problem = 'it uses another block already'
     else:
@@ -417,9 +412,6 @@ class Register(modelled.ModelledEntity):
 
   def detach_from_root(self) -> None:
     """Undoes `attach_to`."""
-    for block in self._blocks:
-      if isinstance(block, mocap_blocks.MocapBlock):
-        block.detach_from_root()
     self.detach()
 
   def initialize_episode(
@@ -564,8 +556,7 @@ class Register(modelled.ModelledEntity):
     fits = (value >= self._low) & (value <= self._high)  # False for NaN.
     applied = value if axes.everywhere(fits) else self._saturate(value, fits)
     applied = self.nearest(applied)
-    # Nothing can move a welded block away from its axis.
-    if self._write == 'pose' or self._channel == 'welded':
+    if self._write == 'pose':
       self._put(physics, applied, where)
       placed = applied
     else:
@@ -743,8 +734,8 @@ class Register(modelled.ModelledEntity):
 
   def _add_block(
       self, name: str, class_name: str, position: Sequence[float]
-  ) -> block_kinds.Block:
-    """Adds a block of the kind that the channel requires.
+  ) -> block_kinds.JointedBlock:
+    """Adds a block with the register's degrees of freedom.
 
     Args:
       name: Name of the block within the register.
@@ -754,10 +745,6 @@ class Register(modelled.ModelledEntity):
     """
     style = self._style(class_name)
     half_size = self._block_size / 2
-    if self._channel == 'welded':
-      return mocap_blocks.MocapBlock(
-          f'{self.name}_{name}', position, half_size, style
-      )
     kind = (
         block_kinds.FreeBlock
         if self._dof == 'free'

@@ -227,8 +227,6 @@ class Display(base.Register):
     return [self._base, *self._tiles]
 
   def _add_tile(self, name: str, offset: list[float]) -> block_kinds.Block:
-    if not isinstance(self._base, block_kinds.JointedBlock):
-      return self._add_block(name, block_kinds.OFFSET_BLOCK, offset[:2])
     style = self._style(block_kinds.OFFSET_BLOCK)
     return Tile(self._base, name, offset, _TILE_MASS * self._mass, style)
 

@@ -41,10 +41,9 @@ class TwoBlockRegister(base.Register):
         'offset', block_kinds.OFFSET_BLOCK, (0.0, lateral)
     )
     self._from_origin = np.array([0.0, lateral, 0.0])
-    if self._channel != 'welded':
-      self._exclusion = self._mjcf_root.contact.add(
-          'exclude', body1='base', body2='offset'
-      )
+    self._exclusion = self._mjcf_root.contact.add(
+        'exclude', body1='base', body2='offset'
+    )
     return [self._base, self._offset]
 
   def _use_block(

@@ -113,9 +113,7 @@ class World:
             ' names with one meaning: rename the register',
         )
       blocks = self.registers[name].blocks
-      return measurables.Measurable(
-          tuple(b.body for b in blocks if b.body is not None)
-      )
+      return measurables.Measurable(tuple(b.body for b in blocks))
     if name in self.parts:
       part = self.parts[name]
       self.registers.ask_for_blocks(part.bodies)

@@ -90,8 +90,7 @@ class Speed(base.Measurement):
   """The speed of a part, in m/s.
 
   The speed of a register is that of its fastest block. A write moves a block at
-  once and does not change its velocity, so a welded register has the speed 0. A
-  held block then returns to the hand.
+  once and does not change its velocity. A held block then returns to the hand.
 
   Attributes:
     of: Name of a register or of a part that physics moves.
