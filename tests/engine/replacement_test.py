@@ -107,7 +107,7 @@ def test_twins_of_a_design_stand_in_the_same_places():
     env, _ = helpers.embed(_Generated([_ACROSS]), _design(channel))
     env.reset()
     found.append(_places(env))
-  np.testing.assert_allclose(found[1:], [found[0]] * 2, atol=1e-9)
+  np.testing.assert_allclose(found[1], found[0], atol=1e-9)
 
 
 @pytest.mark.parametrize('other', [(-0.85, 0.0), (0.9, 0.0)])
