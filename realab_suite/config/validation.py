@@ -11,7 +11,7 @@ import hashlib
 import json
 import re
 import types
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Final, Literal, TypeVar
 
 import pydantic
 
@@ -28,6 +28,12 @@ _IN_WORDS_OF_YAML = {
     'model_attributes_type': 'a mapping',
     'model_type': 'a mapping',
     'tuple_type': 'a list',
+}
+NAME: Final = r'^[a-z][a-z0-9_]{0,63}$'
+"""Pattern of names of designs, registers, kinds and runs."""
+
+_PATTERNS = {
+    NAME: 'at most 64 of a-z, 0-9 and _, of which a letter is the first'
 }
 # Types of errors of the classes whose objects no file contains.
 _NOT_IN_FILES = ('needs_python_object', 'dataclass_type')
@@ -302,6 +308,13 @@ def _path(details: Any, data: Any) -> str:
   return messages.format_path(path)
 
 
+def _quote(value: Any) -> str:
+  """Returns a value as YAML has it, cut to a length that fits a message."""
+  if value is None or isinstance(value, bool):
+    return json.dumps(value)
+  return messages.quote(value)
+
+
 def _is_item(details: Any) -> bool:
   """Returns whether what is missing is an item of a list, and not a key."""
   return details['type'] == 'missing' and isinstance(details['loc'][-1], int)
@@ -309,7 +322,7 @@ def _is_item(details: Any) -> bool:
 
 def _describe(details: Any) -> str:
   """Returns the error message, followed by the value."""
-  given = messages.quote(details['input'])
+  given = _quote(details['input'])
   if _is_item(details):
     return f'must have at least {details["loc"][-1] + 1} items, got {given}'
   if details['type'] == 'missing':
@@ -319,6 +332,10 @@ def _describe(details: Any) -> str:
     return f'required key is missing{hint}'
   if details['type'] in _IN_WORDS_OF_YAML:
     return f'must be {_IN_WORDS_OF_YAML[details["type"]]}, got {given}'
+  if details['type'] == 'string_pattern_mismatch':
+    pattern = details['ctx']['pattern']
+    rule = _PATTERNS.get(pattern, f'a text that matches {pattern!r}')
+    return f'must be {rule}, got {given}'
   if 'error' not in details.get('ctx', {}):
     rule = re.sub(r'^\w+ should ', 'must ', details['msg'])
     rule = re.sub(r' after validation, not \w+$', '', rule)

@@ -127,12 +127,28 @@ def _refuse_parts(design: Any) -> None:
 
 
 def _refuse_unwritten(design: Any) -> None:
-  """Refuses registers that agents read and that would stay as they are.
+  """Refuses registers that are read and that would stay as they are.
 
   A stated `initial` is a value to keep: that of a constant, or of a register
   which agents use as a memory.
   """
   written = {name for one in design.providers for name in one.writes}
+  measured = {meter.writes for meter in design.meters}
+  for i, provider in enumerate(design.providers):
+    for name in provider.reads:
+      spec = design.registers.get(name)
+      if (
+          spec is not None
+          and spec.role == 'meter'
+          and name not in measured
+          and 'initial' not in spec.model_fields_set
+      ):
+        raise ValueError(
+            f'providers[{i}].reads: no meter writes the register {name!r};'
+            ' allowed are an entry of meters that does, such as {measures:'
+            f' score, writes: {name}}}, and a stated initial, which the'
+            ' register keeps'
+        )
   for register, names in design.ports_by_register.items():
     spec = design.registers[register]
     if (

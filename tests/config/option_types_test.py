@@ -101,7 +101,7 @@ def _typed() -> Iterator[None]:
         ' half_width)'),
     ('apple_seeker', {'self': 3}, ": unknown key 'self' (allowed: half_w"),
     ('apple_seeker', {'half_width': None},
-        '.half_width: must be a valid number, got None'),
+        '.half_width: must be a valid number, got null'),
     ('apple_seeker', {'half_width': -1},
         '.half_width: must be greater than 0, got -1'),
     ('network_demonstrator', {'weights': ['demonstrator_v1']},

@@ -292,3 +292,10 @@ def test_a_class_registered_anew_replaces_the_old_one():
   for default in (1, 2):
     with helpers.registered(providers.PROVIDERS, 'test_again', kind(default)):
       assert specs.load(design).providers[0].value == default
+
+
+def test_a_meter_register_that_a_provider_reads_is_measured():
+  text = refusals.refusal(specs.load, 'instantaneous_reward', ['meters=[]'])
+  assert "providers[0].reads: no meter writes the register 'score'" in text
+  kept = ['meters=[]', 'registers.score.initial=3']
+  assert not specs.load('instantaneous_reward', kept).meters

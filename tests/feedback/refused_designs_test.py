@@ -22,11 +22,11 @@ _WRONG = {
         "providers[0]: unknown key 'initail'; did you mean 'initial'?",
     'schema=2': 'schema: must be 1, got 2',
     "schema='1'": "schema: must be 1, got '1'",
-    "name=''": "name: must match pattern '^[a-z]",
-    'name="a\\n"': 'name: must match pattern',
-    f'name={"a" * 65}': 'name: must match pattern',
+    "name=''": "name: must be at most 64 of a-z, 0-9",
+    'name="a\\n"': 'name: must be at most 64 of',
+    f'name={"a" * 65}': 'name: must be at most 64 of',
     'registers.Reward=null':
-        "must match pattern '^[a-z][a-z0-9_]{0,63}$', got 'Reward'",
+        "of which a letter is the first, got 'Reward'",
     'registers.reward.range=[3, -3]':
         'registers.reward: range [3.0, -3.0] must have low < high',
     'registers.reward.range=[-1e308, 1e308]':
@@ -80,7 +80,7 @@ _WRONG_ADVICE = {
         "policy 'no_opp' is unknown; did you mean 'no_op'?",
     'providers.0.value_function=oracle': "value function 'oracle' is unknown",
     'providers.0.query_delay=2': 'query_delay: must be 0 or 1, got 2',
-    'providers.0.query_delay=true': 'query_delay: must be 0 or 1, got True',
+    'providers.0.query_delay=true': 'query_delay: must be 0 or 1, got true',
     'providers.0.query_delay=1 & learner={kind: value_advice, advice: reward}':
         'providers[0]: query_delay: 1 here, and 0 in the learner value_advice',
     'learner={kind: decoupled_approval, approval: reward, query_delay: 1}':

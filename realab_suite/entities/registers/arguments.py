@@ -21,9 +21,7 @@ DOFS: tuple[Dof, ...] = typing.get_args(Dof)
 OVERFLOWS: tuple[Overflow, ...] = typing.get_args(Overflow)
 WRITES: tuple[Write, ...] = typing.get_args(Write)
 
-Name = Annotated[
-    str, pydantic.StringConstraints(pattern=r'^[a-z][a-z0-9_]{0,63}$')
-]
+Name = Annotated[str, pydantic.StringConstraints(pattern=validation.NAME)]
 # A text is a name, even one that no name looks like.
 TextOrOther = pydantic.Discriminator(
     lambda value: 'name' if isinstance(value, str) else 'other'
