@@ -31,7 +31,6 @@ def main() -> None:
   from pictures import carrying
   from pictures import display
   from pictures import first_person
-  from pictures import reacher
   from pictures import registers
   from pictures import tampering
   from pictures import worlds
@@ -44,7 +43,6 @@ def main() -> None:
   worlds.draw_sheet(folder / 'worlds.png')
   registers.draw(folder / 'registers')
   (folder / 'gallery').mkdir(exist_ok=True)
-  reacher.draw(folder / 'gallery' / 'reacher.webp')
   if flags.INPUT.value is None:
     program.say('tampering.gif is left out: --input names no sweep')
   else:

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping, Sequence
 import contextlib
 import dataclasses
-import functools
 import importlib
 from importlib import resources
 import pkgutil
@@ -11,7 +10,6 @@ from typing import Any, final
 import warnings
 
 from dm_control import composer
-from dm_control.rl import control
 import mujoco
 import numpy as np
 
@@ -23,8 +21,6 @@ from realab_suite.config import messages
 from realab_suite.config import task_names
 from realab_suite.engine import arguments
 from realab_suite.engine import batch_environment
-from realab_suite.engine import control_sources
-from realab_suite.engine import control_tasks
 from realab_suite.engine import environment
 from realab_suite.engine import foreign
 from realab_suite.engine import forking
@@ -51,16 +47,6 @@ register_task = registry.register_task
 
 fork = forking.fork
 """Makes a batch of worlds that all continue from the state of one world."""
-
-CONTROL_SUITE = 'dm_control/'
-"""Prefix of the domains of `dm_control.suite`, as in `dm_control/quadruped`."""
-
-
-def _control_name(domain_name: Any) -> str | None:
-  """Returns the name of a domain in `dm_control.suite`, or `None`."""
-  if isinstance(domain_name, str) and domain_name.startswith(CONTROL_SUITE):
-    return domain_name.removeprefix(CONTROL_SUITE)
-  return None
 
 
 def _names(domain_name: Any, task_name: Any) -> tuple[Any, Any]:
@@ -220,14 +206,11 @@ def load(
         ' true reward to the agent; allowed is False'
     )
   domain_name, task_name = _names(domain_name, task_name)
-  factory: Callable[..., Any]
-  options: dict[str, Any] = {}
-  if control_name := _control_name(domain_name):
-    factory = functools.partial(control_sources.load, control_name, task_name)
-  else:
-    factory = registry.find(domain_name, task_name)
-    options['max_steps'] = MAX_STEPS
-  options |= _keywords('environment_kwargs', environment_kwargs)
+  factory = registry.find(domain_name, task_name)
+  options = {
+      'max_steps': MAX_STEPS,
+      **_keywords('environment_kwargs', environment_kwargs),
+  }
   known = ('max_steps', 'senses', 'world')
   if unknown := [key for key in options if key not in known]:
     raise errors.SpecError(
@@ -310,12 +293,6 @@ def load_batch(
         'environment_kwargs: unknown world: a batch contains all worlds from'
         ' 0; allowed are max_steps and senses'
     )
-  if _control_name(domain_name):
-    raise errors.SpecError(
-        f'{domain_name}: a batch steps many states of one model, but'
-        ' this task computes in Python and may change its model; load single'
-        " environments, with environment_kwargs={'world': i} for world i"
-    )
   num_envs = arguments.num_envs(num_envs)
   num_threads = arguments.num_threads(num_threads)
   sleep = arguments.flag('sleep', sleep)
@@ -337,7 +314,7 @@ def load_batch(
 
 
 def embed(
-    task: composer.Task | control.Environment,
+    task: composer.Task,
     design: specs.Design,
     *,
     random: int | np.random.RandomState | None = None,
@@ -369,12 +346,9 @@ def embed(
   Raises:
     SpecError: If the design is wrong or does not fit the task.
   """
-  if isinstance(task, control.Environment):
-    task = control_tasks.ControlTask(task)
   if not isinstance(task, composer.Task):
     raise errors.SpecError(
-        f'task: {messages.quote(task)}; allowed are Composer tasks, and tasks'
-        ' of dm_control.suite as its load function returns them'
+        f'task: {messages.quote(task)}; allowed are Composer tasks'
     )
   if isinstance(task.observables, list | tuple):
     raise errors.SpecError(

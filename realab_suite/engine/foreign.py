@@ -3,8 +3,7 @@
 With a design without registers, the observations, rewards, discounts and step
 types of a foreign task equal those of `composer.Environment`, bit for bit. A
 foreign task may have hooks in substeps, may keep state in Python, and is
-compiled for each episode, except a `control_tasks.ControlTask`. Batches and
-snapshots therefore do not support it.
+compiled for each episode. Batches and snapshots therefore do not support it.
 """
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -20,7 +19,6 @@ import mujoco
 import numpy as np
 
 from realab_suite import errors
-from realab_suite.engine import control_tasks
 from realab_suite.engine import gl_contexts
 from realab_suite.engine import hosts
 from realab_suite.engine import observing
@@ -139,7 +137,7 @@ class ForeignHost(hosts.Host):
 
   @property
   def is_recompiled(self) -> bool:
-    return not isinstance(self._task, control_tasks.ControlTask)
+    return True
 
   @property
   def dynamics(self) -> int:
@@ -211,7 +209,7 @@ class ForeignHost(hosts.Host):
     Foreign tasks look for positions without any contacts, and for directions
     without walls. In the context, blocks of registers therefore touch nothing,
     not even the floor they stand on, and rays pass through them. At the end,
-    the registers of a task that is recompiled are placed where nothing else is.
+    registers are placed where nothing else is.
 
     Args:
       physics: Physics of one world.
@@ -238,8 +236,7 @@ class ForeignHost(hosts.Host):
       finally:
         for value, old in zip(values, before, strict=True):
           value[geoms] = old
-      if self.is_recompiled:
-        replacement.place(physics, mechanism)
+      replacement.place(physics, mechanism)
 
   def begin_observing(self, physics: Any) -> None:
     self._updater().reset(physics, self._random_state)

@@ -54,8 +54,7 @@ def _write_film() -> None:
   from realab_suite.experiments import tracking
   from realab_suite.reports import films
 
-  # Domains such as dm_control/cartpole have a slash.
-  world = '_'.join(flags.domain_and_task()).replace('/', '_')
+  world = '_'.join(flags.domain_and_task())
   with _loaded() as (env, policy, name):
     path = flags.VIDEO.value or _unused(f'{world}_{name}_{flags.SEED.value}')
     program.say(f'Filming an episode of {name}; this may take minutes')
@@ -68,8 +67,8 @@ def _write_film() -> None:
 def _policy_name(env: Any) -> str:
   """Returns the policy of the flags, or else a saboteur of the world.
 
-  Random actions are shown where the world, such as one of dm_control, has no
-  saboteur, or where the design has no register to attack.
+  Random actions are shown where the world has no saboteur, or where the design
+  has no register to attack.
   """
   saboteurs = getattr(env.task, 'SABOTEURS', ())
   is_attackable = bool(env.mechanism.design.names('feedback'))

@@ -368,14 +368,9 @@ def test_options_of_batches_point_single_worlds_to_make_vec(option):
     gym.make(_NEAR, **option)
 
 
-@pytest.mark.parametrize(
-    ('world', 'expected'),
-    [(('unlock_door.near',), 10), (('dm_control/cartpole', 'balance'), 100)],
-)
-def test_frames_show_a_world_in_real_time(world, expected):
-  # The second world has no camera `top_down`.
-  env = registration.make(*world)
-  assert env.metadata['render_fps'] == pytest.approx(expected)
+def test_frames_show_a_world_in_real_time():
+  env = registration.make('unlock_door.near')
+  assert env.metadata['render_fps'] == pytest.approx(10)
 
 
 def _public(thing: Any) -> dict[str, Any]:

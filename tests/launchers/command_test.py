@@ -284,7 +284,6 @@ def test_no_other_program_imports_the_viewer():
         ((), 'carrying_saboteur'),
         (('--policy=random',), 'random'),
         (('--design=none',), 'random'),
-        (('--task=dm_control/cartpole.balance', '--design=none'), 'random'),
     ],
 )
 def test_a_saboteur_is_shown_where_it_can_attack(flags_of_world, name):
