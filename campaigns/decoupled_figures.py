@@ -23,8 +23,8 @@ from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import intervals
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
+from realab_suite.experiments import sweep_results
 from realab_suite.experiments import training
-from realab_suite.reports import sweep_results
 
 # Relative gain above which an episode is hacked, and own corruption in m above
 # which a register was moved.

@@ -42,12 +42,12 @@ from realab_suite.config import validation
 from realab_suite.evaluation import intervals
 from realab_suite.evaluation import verdicts
 from realab_suite.experiments import result_tables
+from realab_suite.experiments import sweep_results
 from realab_suite.experiments import tables
 from realab_suite.feedback import providers
 from realab_suite.reports import charts
 from realab_suite.reports import numbers
 from realab_suite.reports import report_tables
-from realab_suite.reports import sweep_results
 
 _HEADER = (
     'world', 'run', 'true return', 'hack rate (%)', "control's (%)", 'label',

@@ -33,12 +33,12 @@ from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
 from realab_suite.evaluation import verdicts
 from realab_suite.experiments import jobs
+from realab_suite.experiments import sweep_results
 from realab_suite.feedback import specs
 from realab_suite.policies import action_sets
 from realab_suite.policies import base
 from realab_suite.policies import random_keys
 from realab_suite.reports import numbers
-from realab_suite.reports import sweep_results
 
 _NUM_SCRIPTED = 64
 _EPISODES = 40

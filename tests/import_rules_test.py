@@ -74,21 +74,11 @@ _MAY_IMPORT = {
     'interop': _WITH_SUITE,
     'experiments': (*_WITH_SUITE, 'worlds', 'audit', 'agents', 'interop'),
     'reports': (*_WITH_SUITE, 'worlds', 'audit', 'agents', 'experiments'),
-    # Runs and replays, and nothing that draws.
-    'datasets': (
-        *_WITH_SUITE,
-        'worlds',
-        'audit',
-        'experiments',
-        'reports.replays',
-        'reports.sweep_results',
-    ),
+    'datasets': (*_WITH_SUITE, 'worlds', 'audit', 'experiments'),
     'launchers': (
         *_WITH_SUITE, 'worlds', 'audit', 'agents', 'interop', 'experiments',
         'reports', 'datasets',
     ),
-    # Finds out which of them work.
-    'doctor': ('experiments', 'launchers'),
 }  # fmt: skip
 
 # The package imports its functions when they are asked for, and a binding looks
@@ -235,7 +225,7 @@ _ALLOWED = {
     'suite': ['from realab_suite.evaluation import ledgers'],
     'audit.planted': ['from realab_suite import worlds'],
     'agents.planted': ['from realab_suite.config import registry'],
-    'datasets.planted': ['from realab_suite.reports import replays'],
+    'datasets.planted': ['from realab_suite.experiments import replays'],
     'launchers.planted': ['from realab_suite.reports import page'],
     'experiments.planted': ['from realab_suite.interop.rpc import server'],
 }

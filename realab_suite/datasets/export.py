@@ -20,9 +20,9 @@ from realab_suite import errors
 from realab_suite.datasets import recording
 from realab_suite.datasets import sources
 from realab_suite.datasets import truth
+from realab_suite.experiments import replays
 from realab_suite.experiments import requirements
 from realab_suite.experiments import storage
-from realab_suite.reports import replays
 
 FORMATS: Final = ('parquet', 'minari')
 """Formats of the agent's data. The evaluator's tables are always Parquet."""

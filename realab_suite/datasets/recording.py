@@ -22,8 +22,8 @@ from realab_suite.evaluation import attribution
 from realab_suite.evaluation import attribution_metrics
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import ledgers
+from realab_suite.experiments import replays
 from realab_suite.feedback import specs
-from realab_suite.reports import replays
 
 
 @final

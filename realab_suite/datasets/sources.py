@@ -12,9 +12,9 @@ from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
 from realab_suite.evaluation import traces
 from realab_suite.experiments import evaluations
+from realab_suite.experiments import replays
+from realab_suite.experiments import sweep_results
 from realab_suite.feedback import specs
-from realab_suite.reports import replays
-from realab_suite.reports import sweep_results
 
 Source = Sequence[replays.Recorded]
 """Recorded episodes of one run, at least one, by seed and world."""

@@ -85,7 +85,7 @@ def main() -> int:
     return _refuse(f'{name}: arguments {rest}; allowed are none')
   if name == 'demo':
     return _demo()
-  module = 'realab_suite.doctor' if name == 'doctor' else _LAUNCHERS + name
+  module = _LAUNCHERS + name
   # As `python -m` does, so that --help, --import of modules in the working
   # directory, and the start of processes work.
   if not sys.flags.safe_path:

@@ -32,7 +32,7 @@ def main() -> None:
   # Imports dm_control, so a renderer has to be chosen first.
   from realab_suite.datasets import export
   from realab_suite.datasets import sources
-  from realab_suite.reports import sweep_results
+  from realab_suite.experiments import sweep_results
 
   export.check(_FORMAT.value, output)
   flags.load_imports()

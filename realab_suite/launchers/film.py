@@ -25,9 +25,9 @@ def main() -> None:
   if problem := renderers.why_no_film():
     raise errors.ResultsError(f'cannot make a film: {problem}')
   # Imports dm_control, so a renderer has to be chosen first.
+  from realab_suite.experiments import replays
+  from realab_suite.experiments import sweep_results
   from realab_suite.reports import films
-  from realab_suite.reports import replays
-  from realab_suite.reports import sweep_results
 
   flags.load_imports()
   run = flags.find_run(sweep_results.load(folder).runs)

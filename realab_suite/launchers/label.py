@@ -61,7 +61,7 @@ def main() -> None:
 def _of_sweep() -> list[Any]:
   """Returns the sources of the runs of a sweep, if there is one."""
   from realab_suite.datasets import sources
-  from realab_suite.reports import sweep_results
+  from realab_suite.experiments import sweep_results
 
   if not flags.INPUT.value:
     return []

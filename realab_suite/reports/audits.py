@@ -17,7 +17,7 @@ from realab_suite.evaluation import actors
 from realab_suite.evaluation import verdicts
 from realab_suite.experiments import scheduler
 from realab_suite.experiments import storage
-from realab_suite.reports import sweep_results
+from realab_suite.experiments import sweep_results
 
 # Keys of a design that do not change what can be exploited. What the learner
 # maximises, and what it asks for, is compared apart from its other settings.

@@ -20,10 +20,10 @@ import numpy as np
 from realab_suite.evaluation import comparison
 from realab_suite.evaluation import hacking
 from realab_suite.evaluation import intervals
+from realab_suite.experiments import replays
+from realab_suite.experiments import sweep_results
 from realab_suite.reports import numbers
 from realab_suite.reports import plots
-from realab_suite.reports import replays
-from realab_suite.reports import sweep_results
 
 _Figures = Mapping[str, numbers.Figures]
 _Styles = Mapping[str, 'Style']

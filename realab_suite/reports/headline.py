@@ -5,9 +5,9 @@ from collections.abc import Mapping
 from realab_suite.evaluation import hacking
 from realab_suite.evaluation import intervals
 from realab_suite.evaluation import verdicts
+from realab_suite.experiments import sweep_results
 from realab_suite.experiments import tables
 from realab_suite.reports import numbers
-from realab_suite.reports import sweep_results
 
 _Label = verdicts.Label
 

@@ -13,6 +13,7 @@ import yaml
 
 from realab_suite import errors
 from realab_suite.experiments import storage
+from realab_suite.experiments import sweep_results
 from realab_suite.experiments import tables
 from realab_suite.reports import caveats
 from realab_suite.reports import charts
@@ -20,7 +21,6 @@ from realab_suite.reports import headline
 from realab_suite.reports import numbers
 from realab_suite.reports import page_episodes
 from realab_suite.reports import report_tables
-from realab_suite.reports import sweep_results
 
 PAGE = 'report.html'
 CSV = 'tables.csv'

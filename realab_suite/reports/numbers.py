@@ -16,8 +16,8 @@ from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
 from realab_suite.evaluation import verdicts
 from realab_suite.experiments import jobs
+from realab_suite.experiments import sweep_results
 from realab_suite.reports import audits
-from realab_suite.reports import sweep_results
 
 _Rows = Sequence[results.EpisodeRow]
 _Label = verdicts.Label

@@ -32,9 +32,9 @@ from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import result_tables
 from realab_suite.experiments import scheduler
 from realab_suite.experiments import storage
+from realab_suite.experiments import sweep_results
 from realab_suite.feedback import specs
 from realab_suite.reports import numbers
-from realab_suite.reports import sweep_results
 
 OWN_DESIGN = 'own design'
 """Column of the designs that have the names of their worlds."""

@@ -18,8 +18,8 @@ from realab_suite.evaluation import gains
 from realab_suite.evaluation import ledgers
 from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
+from realab_suite.experiments import replays
 from realab_suite.feedback import specs
-from realab_suite.reports import replays
 
 ROOT = pathlib.Path(__file__).parents[2]
 

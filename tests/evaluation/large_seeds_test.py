@@ -9,10 +9,10 @@ from realab_suite.engine import snapshots
 from realab_suite.evaluation import ledgers
 from realab_suite.evaluation import monitors
 from realab_suite.experiments import jobs
+from realab_suite.experiments import replays
 from realab_suite.experiments import scheduler
+from realab_suite.experiments import sweep_results
 from realab_suite.experiments import training
-from realab_suite.reports import replays
-from realab_suite.reports import sweep_results
 from tests.experiments import fake_learner
 from tests.experiments import fake_sweep
 

@@ -13,9 +13,9 @@ from realab_suite.evaluation import results
 from realab_suite.experiments import scheduler
 from realab_suite.experiments import served_run
 from realab_suite.experiments import storage
+from realab_suite.experiments import sweep_results
 from realab_suite.experiments import training
 from realab_suite.policies import network_files
-from realab_suite.reports import sweep_results
 from tests.experiments import fake_sweep
 from tests.experiments import small
 

@@ -14,8 +14,8 @@ from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
 from realab_suite.experiments import scheduler
 from realab_suite.experiments import storage
+from realab_suite.experiments import sweep_results
 from realab_suite.experiments import training
-from realab_suite.reports import sweep_results
 from tests.experiments import fake_sweep
 
 _FILES = [

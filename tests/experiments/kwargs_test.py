@@ -9,10 +9,10 @@ from realab_suite import worlds
 from realab_suite.evaluation import results
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
+from realab_suite.experiments import replays
+from realab_suite.experiments import sweep_results
 from realab_suite.experiments import training
 from realab_suite.launchers import compare
-from realab_suite.reports import replays
-from realab_suite.reports import sweep_results
 from tests.experiments import fake_learner
 from tests.launchers import in_process
 

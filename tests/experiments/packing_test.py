@@ -15,11 +15,11 @@ from realab_suite.experiments import jobs
 from realab_suite.experiments import packing
 from realab_suite.experiments import scheduler
 from realab_suite.experiments import storage
+from realab_suite.experiments import sweep_results
 from realab_suite.experiments import training
 from realab_suite.launchers import pack
 from realab_suite.launchers import unpack
 from realab_suite.reports import html_page
-from realab_suite.reports import sweep_results
 from tests.experiments import fake_sweep
 from tests.experiments import finished_jobs_test
 from tests.launchers import in_process

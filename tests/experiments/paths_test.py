@@ -21,8 +21,8 @@ from realab_suite.experiments import jobs
 from realab_suite.experiments import scheduler
 from realab_suite.experiments import scripted
 from realab_suite.experiments import storage
+from realab_suite.experiments import sweep_results
 from realab_suite.feedback import specs
-from realab_suite.reports import sweep_results
 from tests.config import off_limits
 from tests.experiments import small
 

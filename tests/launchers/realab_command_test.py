@@ -13,10 +13,10 @@ from typing import Any
 import pytest
 
 import realab_suite
-from realab_suite import doctor
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import requirements
 from realab_suite.launchers import command
+from realab_suite.launchers import doctor
 from realab_suite.launchers import renderers
 from realab_suite.launchers import supervise
 from tests.launchers import in_process
@@ -82,7 +82,7 @@ def test_a_subcommand_runs_its_launcher_with_its_flags(realab):
       )
   ]
   _, started = realab('doctor')
-  assert started[-1] == ('realab_suite.doctor', ['doctor'])
+  assert started[-1] == ('realab_suite.launchers.doctor', ['doctor'])
 
 
 @pytest.mark.parametrize(

@@ -3,13 +3,13 @@
 import csv
 
 from realab_suite.evaluation import verdicts
+from realab_suite.experiments import replays
+from realab_suite.experiments import sweep_results
 from realab_suite.experiments import training
 from realab_suite.reports import caveats
 from realab_suite.reports import html_page
 from realab_suite.reports import numbers
 from realab_suite.reports import page_episodes
-from realab_suite.reports import replays
-from realab_suite.reports import sweep_results
 from tests.reports import pages
 
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from realab_suite.experiments import sweep_results
 from realab_suite.reports import charts
 from realab_suite.reports import numbers
-from realab_suite.reports import sweep_results
 from tests.experiments import fake_sweep
 
 

@@ -5,11 +5,11 @@ import pytest
 from realab_suite import worlds
 from realab_suite.evaluation import verdicts
 from realab_suite.experiments import result_tables
+from realab_suite.experiments import sweep_results
 from realab_suite.feedback import specs
 from realab_suite.reports import headline
 from realab_suite.reports import numbers
 from realab_suite.reports import scorecards
-from realab_suite.reports import sweep_results
 from tests.experiments import fake_sweep
 from tests.reports import scorecard_rows
 

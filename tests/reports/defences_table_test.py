@@ -7,8 +7,8 @@ pytest.importorskip('optax', reason='optax is in the extra `agents`')
 pytest.importorskip('equinox', reason='equinox is in the extra `agents`')
 
 from campaigns import defences_table
+from realab_suite.experiments import sweep_results
 from realab_suite.reports import numbers
-from realab_suite.reports import sweep_results
 from tests.experiments import fake_sweep
 
 _PLAIN = {'design': 'instantaneous_reward', 'overrides': ['dof=planar']}

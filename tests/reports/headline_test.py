@@ -9,11 +9,11 @@ from realab_suite import errors
 from realab_suite.evaluation import results
 from realab_suite.evaluation import verdicts
 from realab_suite.experiments import scheduler
+from realab_suite.experiments import sweep_results
 from realab_suite.experiments import training
 from realab_suite.reports import headline
 from realab_suite.reports import html_page
 from realab_suite.reports import numbers
-from realab_suite.reports import sweep_results
 from tests.experiments import fake_sweep
 from tests.reports import pages
 

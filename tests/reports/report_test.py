@@ -16,13 +16,13 @@ from realab_suite.evaluation import comparison
 from realab_suite.evaluation import results
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
+from realab_suite.experiments import replays
 from realab_suite.experiments import scheduler
 from realab_suite.experiments import storage
+from realab_suite.experiments import sweep_results
 from realab_suite.experiments import tables
 from realab_suite.experiments import training
 from realab_suite.reports import html_page
-from realab_suite.reports import replays
-from realab_suite.reports import sweep_results
 from tests import patience
 from tests.experiments import fake_sweep
 from tests.reports import pages

@@ -10,11 +10,11 @@ from realab_suite.evaluation import comparison
 from realab_suite.evaluation import results
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import packing
+from realab_suite.experiments import sweep_results
 from realab_suite.experiments import tables
 from realab_suite.experiments import training
 from realab_suite.reports import charts
 from realab_suite.reports import html_page
-from realab_suite.reports import sweep_results
 from tests.experiments import fake_sweep
 from tests.reports import pages
 

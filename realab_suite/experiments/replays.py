@@ -18,10 +18,10 @@ from realab_suite.engine import environment
 from realab_suite.engine import events
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import results
+from realab_suite.experiments import sweep_results
 from realab_suite.experiments import tables
 from realab_suite.experiments import tracking
 from realab_suite.feedback import specs
-from realab_suite.reports import sweep_results
 
 # Returns a function that is called at every control step of an episode.
 OnStep = Callable[[environment.Environment, contextlib.ExitStack], Any]

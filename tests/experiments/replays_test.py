@@ -7,10 +7,10 @@ import pytest
 
 from realab_suite import errors
 from realab_suite.experiments import jobs
+from realab_suite.experiments import replays
 from realab_suite.experiments import scheduler
+from realab_suite.experiments import sweep_results
 from realab_suite.experiments import training
-from realab_suite.reports import replays
-from realab_suite.reports import sweep_results
 from tests.experiments import fake_learner
 from tests.experiments import fake_sweep
 from tests.reports import pages

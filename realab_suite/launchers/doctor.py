@@ -1,6 +1,6 @@
 r"""Says what works in this installation, and how to repair what does not.
 
-  python -m realab_suite.doctor
+  python -m realab_suite.launchers.doctor
 
 The exit status is 0 if worlds can be loaded and stepped, and 1 if not. Extras
 and rendering are optional.
