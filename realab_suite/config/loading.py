@@ -33,7 +33,7 @@ _TOO_DEEP = f'nested deeper than {_MAX_DEPTH}'
 _MAX_INT = 2**53
 
 # Categories of Unicode: control, format (which includes bidirectional marks and
-# the byte order mark), surrogate, line separator and paragraph separator.
+# other byte order marks), surrogate, line separator and paragraph separator.
 _FORBIDDEN_CATEGORIES = frozenset({'Cc', 'Cf', 'Cs', 'Zl', 'Zp'})
 # Not characters of YAML.
 _NONCHARACTERS = '\ufffe\uffff'
@@ -278,8 +278,9 @@ def _documents(text: str | bytes, where: str) -> list[Any]:
 
 
 def _decoded(content: bytes, where: str) -> str:
+  """Returns a text without the byte order mark that some editors write."""
   try:
-    return content.decode(errors='surrogatepass')
+    return content.decode('utf-8-sig', errors='surrogatepass')
   except UnicodeDecodeError as error:
     line = content.count(b'\n', 0, error.start) + 1
     raise messages.Location(where, line=line).error(

@@ -29,9 +29,15 @@ providers:
 
 
 @pytest.mark.parametrize(
-    'text', [_VALID, _VALID.encode(), _VALID.replace('\n', '\r\n')]
+    'text',
+    [
+        _VALID,
+        _VALID.encode(),
+        _VALID.encode('utf-8-sig'),
+        _VALID.replace('\n', '\r\n'),
+    ],
 )
-def test_text_bytes_and_windows_newlines_give_the_same_plain_values(text):
+def test_each_encoding_gives_the_same_plain_values(text):
   assert loading.parse_yaml(text, 'f.yaml') == {
       'spec_version': 1,
       'registers': {
