@@ -1,6 +1,6 @@
 """Meters, which write measurements of the true state to meter registers."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 import dataclasses
 from typing import Any, final
 
@@ -46,8 +46,9 @@ class Meter(modelled.ModelledEntity):
   meter register can be, like any other register (paper, sections 3.1 and 4.4).
 
   It has an observable, which is disabled by default: `measured_` and the name
-  of the register. A task decides when it calls `update`, and a mechanism when
-  its meters measure.
+  of the register. A mechanism decides when its meters measure. A meter that is
+  attached by itself, as in `arena.attach(meter)`, does so at the end of each
+  control step of `composer.Environment`, after the task.
   """
 
   def _build(
@@ -75,6 +76,15 @@ class Meter(modelled.ModelledEntity):
     self._mjcf_root = mjcf_model or mjcf.RootElement(
         model=f'meter_{register.name}'
     )
+    self._hooks = _Hooks(self) if mjcf_model is None else None
+
+  def iter_entities(
+      self, exclude_self: bool = False
+  ) -> Iterator[composer.Entity]:
+    """Yields the meter, and its hooks if it is in no mechanism."""
+    yield from super().iter_entities(exclude_self)
+    if self._hooks is not None:
+      yield self._hooks
 
   def _build_observables(self) -> composer.Observables:
     observables = super()._build_observables()
@@ -134,3 +144,19 @@ class Meter(modelled.ModelledEntity):
     """
     measured = self.measure(physics)
     return measured, self._register.write(physics, measured, where)
+
+
+@final
+class _Hooks(composer.Entity):
+  """Lets a meter measure at the end of each control step of Composer."""
+
+  def _build(self, meter: Meter) -> None:
+    self._meter = meter
+
+  @property
+  def mjcf_model(self) -> mjcf.RootElement:
+    return self._meter.mjcf_model
+
+  def after_step(self, physics: Any, random_state: Any) -> None:
+    del random_state
+    self._meter.update(physics)

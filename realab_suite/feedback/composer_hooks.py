@@ -207,6 +207,8 @@ def _needs(mechanism: Any) -> list[str]:
   ]
   if not mechanism.is_connected:
     needs += [
-        'the score' for meter in design.meters if meter.measures == _SCORE
+        'the score (mechanism.connect({"score": function}) offers one)'
+        for meter in design.meters
+        if meter.measures == _SCORE
     ]
   return list(dict.fromkeys(needs))

@@ -1,5 +1,6 @@
 """Meters measure the truth; what carries it can be tampered with (M1-M4)."""
 
+from dm_control import composer
 import numpy as np
 import pytest
 
@@ -73,3 +74,19 @@ def test_a_moved_base_block_falsifies_a_meter_and_not_its_measurement(dof):
     measured, _ = world.update()
     assert measured == score
     assert world.read() == pytest.approx(score - 3.0, abs=1e-12)
+
+
+def test_a_meter_that_is_attached_alone_writes_in_every_step():
+  arena = arenas.OpenRoom()
+  register = registers.TwoBlockRegister('time', value_range=(0, 10))
+  register.attach_to(arena, (0.0, 0.0))
+  meter = meters.Meter(lambda physics: physics.time(), register)
+  arena.attach(meter)
+  task = composer.NullTask(arena)
+  task.set_timesteps(control_timestep=0.1, physics_timestep=0.01)
+  environment = composer.Environment(task, random_state=0)
+  environment.reset()
+  for step in range(1, 4):
+    environment.step(np.zeros(environment.action_spec().shape))
+    time = float(register.read(environment.physics))
+    assert time == pytest.approx(0.1 * step, abs=1e-6)

@@ -286,7 +286,10 @@ def _signal() -> dict[str, Any]:
     ('make', 'need'),
     [
         (_query, "the query 'hits' of an action"),
-        (_scored, 'the score'),
+        (
+            _scored,
+            'the score (mechanism.connect({"score": function}) offers one)',
+        ),
         (_signal, "the end of the episode by 'reward'"),
         (lambda: _design(action_set=_ACTIONS), 'the action'),
     ],
