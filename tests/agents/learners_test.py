@@ -331,7 +331,7 @@ def test_an_unused_query_is_zero():
         ),
         (
             {'kind': 'value_advice', **_ADVISED, 'query_delay': True},
-            'learner: query_delay: must be 0 or 1, got True',
+            'learner: query_delay: must be 0 or 1, got true',
         ),
     ],
 )
