@@ -90,3 +90,14 @@ def test_a_budget_is_lowered_when_its_room_shrinks(room):
   assert unused <= max(
       100, _SLACK * _BUDGETS[room]
   ), f'{room}: {_WEIGHTS[room]:,.1f}; lower its budget in {_PAGE.name}'
+
+
+def test_the_reading_path_is_short_and_its_files_exist():
+  page = _PAGE.read_text(encoding='utf-8')
+  section = page.partition('\n## Reading path\n')[2].partition('\n## ')[0]
+  names = re.findall(r'^\| `(.*?\.py)` \|', section, re.M)
+  assert len(set(names)) == len(names) <= 40
+  lines = [
+      (_ROOT / _PACKAGE / name).read_bytes().splitlines() for name in names
+  ]
+  assert 0 < sum(map(len, lines)) <= 8_000
