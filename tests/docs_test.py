@@ -7,6 +7,7 @@ import runpy
 import sys
 
 from absl import flags as absl_flags
+from absl import logging
 import pytest
 import yaml
 
@@ -52,9 +53,11 @@ _OTHER_FILES = frozenset({
 
 @pytest.fixture(name='registries')
 def fixture_registries():
-  """Removes the entries that a page registers."""
+  """Undoes what a page registers and silences."""
+  verbosity = logging.get_verbosity()
   with registries.preserved():
     yield
+  logging.set_verbosity(verbosity)
 
 
 def _is_of_an_evaluator(page):
