@@ -205,13 +205,13 @@ def main() -> None:
   parser = argparse.ArgumentParser(description=__doc__)
   parser.add_argument('--output', required=True, type=pathlib.Path)
   parser.add_argument('--steps', default=STEPS, type=int)
-  chosen = parser.parse_args()
+  arguments = parser.parse_args()
   # Designs refer to networks by name, so files must not change.
-  if chosen.output.exists():
-    parser.error(f'{chosen.output} already exists; name another file')
-  chosen.output.parent.mkdir(parents=True, exist_ok=True)
-  network = make(steps=chosen.steps)
-  chosen.output.write_bytes(network.to_bytes())
+  if arguments.output.exists():
+    parser.error(f'{arguments.output} already exists; name another file')
+  arguments.output.parent.mkdir(parents=True, exist_ok=True)
+  network = make(steps=arguments.steps)
+  arguments.output.write_bytes(network.to_bytes())
   for reached in network.header.reached:
     print(
         f'true return {reached["mean"]:.2f} [{reached["low"]:.2f},'

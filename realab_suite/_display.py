@@ -68,9 +68,9 @@ def what_to_set(renderer: str | None, error: Exception | str) -> str:
   others = [text for name, text in _RENDERERS.items() if name != renderer]
   named = os.environ.get(_VARIABLE)
   # That of dm_control may have been chosen without the variable.
-  chosen = f'{_VARIABLE}={named}' if named else f'the renderer {renderer}'
+  setting = f'{_VARIABLE}={named}' if named else f'the renderer {renderer}'
   return (
-      f'{chosen} ({lines[0] if lines else type(error).__name__}); set'
+      f'{setting} ({lines[0] if lines else type(error).__name__}); set'
       f' {_VARIABLE} to {", ".join(others[:-1])} or {others[-1]} before Python'
       ' starts'
   )
