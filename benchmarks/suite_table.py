@@ -29,6 +29,7 @@ from realab_suite.audit import aiming
 from realab_suite.audit import audits
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import results
 from realab_suite.feedback import specs
 from realab_suite.policies import errands
 from realab_suite.policies import navigation
@@ -78,10 +79,10 @@ def outcomes(domain: str, task: str) -> Cells:
   with contextlib.closing(_load(domain, task)) as env:
     best, most = env.task.best_mean_return, env.task.max_true_return
     solver = policies.make(env.task.SOLVER)
-    results = evaluate.evaluate(env, solver, _EPISODES)
+    episodes = evaluate.evaluate(env, solver, _EPISODES)
     shown = f'{most:g}' if best == most else f'{best:g} on average'
-    cells['solver'] = f'{_mean(results, "true_return"):.3g} of {shown}'
-    cells['honest'] = f'{_mean(results, "corruption"):.3g}'
+    cells['solver'] = f'{_mean(episodes, "true_return"):.3g} of {shown}'
+    cells['honest'] = f'{_mean(episodes, "corruption"):.3g}'
     played = {
         target: _sabotage(env, target)
         for target in aiming.attacked(env.mechanism.design)
@@ -91,9 +92,9 @@ def outcomes(domain: str, task: str) -> Cells:
   cells['gain'] = f'{_gain(played[target]):,.4g}'
   cells['saboteur'] = f'{_mean(played[target], "true_return"):.3g}'
   with contextlib.closing(_load(domain, task, ['channel=secure'])) as env:
-    results = _sabotage(env, target)
-  corruption = _mean(results, 'corruption')
-  cells['twin'] = f'{_gain(results):.3g}; {corruption:.3g}'
+    episodes = _sabotage(env, target)
+  corruption = _mean(episodes, 'corruption')
+  cells['twin'] = f'{_gain(episodes):.3g}; {corruption:.3g}'
   return cells
 
 
@@ -176,22 +177,22 @@ def _load(domain: str, task: str, overrides: Sequence[str] = ()) -> Any:
   )
 
 
-def _sabotage(env: Any, target: str) -> list[evaluate.EpisodeResult]:
-  results = []
+def _sabotage(env: Any, target: str) -> list[results.EpisodeResult]:
+  episodes: list[results.EpisodeResult] = []
   for episode in range(_EPISODES):
     policy = aiming.make_policy(_SABOTEUR, env, target, episode)
-    results += evaluate.evaluate(env, policy, 1, first_episode=episode)
-  return results
+    episodes += evaluate.evaluate(env, policy, 1, first_episode=episode)
+  return episodes
 
 
-def _mean(results: Sequence[evaluate.EpisodeResult], name: str) -> float:
-  return float(np.mean([getattr(one, name) or 0.0 for one in results]))
+def _mean(episodes: Sequence[results.EpisodeResult], name: str) -> float:
+  return float(np.mean([getattr(one, name) or 0.0 for one in episodes]))
 
 
-def _gain(results: Sequence[evaluate.EpisodeResult]) -> float:
+def _gain(episodes: Sequence[results.EpisodeResult]) -> float:
   """Returns the mean gain by the objective as a whole, in its units."""
   return float(
-      np.mean([next(iter(one.objective.values())).gain for one in results])
+      np.mean([next(iter(one.objective.values())).gain for one in episodes])
   )
 
 
@@ -237,9 +238,9 @@ def supervised() -> dict[str, Any]:
     for overrides in ([], ['channel=secure']):
       with contextlib.closing(_load('supervised_room', task, overrides)) as env:
         for name, policy in _gatherers(env):
-          results = evaluate.evaluate(env, policy, _EPISODES)
-          earned = _mean(results, 'true_return')
-          above = _mean(results, 'observed_return') - earned
+          episodes = evaluate.evaluate(env, policy, _EPISODES)
+          earned = _mean(episodes, 'true_return')
+          above = _mean(episodes, 'observed_return') - earned
           cells.setdefault(name, []).extend(
               f'{round(number, 6) + 0.0:.3g}' for number in (earned, above)
           )

@@ -21,6 +21,7 @@ import sys
 from realab_suite.evaluation import comparison
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import intervals
+from realab_suite.evaluation import stakes
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
 from realab_suite.experiments import sweep_results
@@ -91,7 +92,8 @@ def figures(
   for row in run.rows:
     one = row.objective['mean']
     gain = one.observed - one.clean
-    stake = row.stake.main.estimate if row.stake else math.nan
+    stakes_of_run = stakes.of(row)
+    stake = stakes_of_run.main.estimate if stakes_of_run else math.nan
     add('true', row.seed, row.true_return)
     add('gain', row.seed, gain)
     add('relative', row.seed, gain / stake)
@@ -134,7 +136,7 @@ def main(folder: str, share: str = '0.25') -> None:
   for name, run in sweep_results.load(path).runs.items():
     if run.rows:
       cells = figures(run, greedy.get(name), float(share))
-      print(f'| `{name}` | {len(run.folders)} | ' + ' | '.join(cells) + ' |')
+      print(f'| `{name}` | {len(run.configs)} | ' + ' | '.join(cells) + ' |')
 
 
 if __name__ == '__main__':

@@ -194,7 +194,7 @@ def _foreign_control(world: str) -> tuple[stakes.Stakes, hacking.Control]:
 
 def _scripted(
     name: str,
-    found: Sequence[evaluate.EpisodeResult],
+    found: Sequence[results.EpisodeResult],
     stake: stakes.Stakes,
     control: hacking.Control,
 ) -> Verdict:
@@ -225,7 +225,7 @@ def _play(
     policy: base.Policy,
     episodes: int,
     seed: int,
-) -> list[evaluate.EpisodeResult]:
+) -> list[results.EpisodeResult]:
   with contextlib.closing(
       world.load_batch(design, episodes, seed, sleep=True)
   ) as batch:
@@ -255,10 +255,10 @@ def trained(folders: Sequence[pathlib.Path]) -> Iterator[Verdict]:
 
 def _beside(
     name: str,
-    rows: Sequence[results.EpisodeRow],
-    others: Sequence[results.EpisodeRow],
+    rows: Sequence[results.EpisodeResult],
+    others: Sequence[results.EpisodeResult],
 ) -> Verdict:
-  stake = rows[0].stake
+  stake = stakes.of(rows[0])
   control = stake and hacking.control('others', others, stake)
   if stake is None or control is None:
     raise ValueError(f'{name}: no stakes')
@@ -269,9 +269,9 @@ def _beside(
 
 
 def _by_seed(
-    rows: Sequence[results.EpisodeRow],
-) -> dict[int, list[results.EpisodeRow]]:
-  found: dict[int, list[results.EpisodeRow]] = {}
+    rows: Sequence[results.EpisodeResult],
+) -> dict[int, list[results.EpisodeResult]]:
+  found: dict[int, list[results.EpisodeResult]] = {}
   for row in rows:
     if row.counts:
       found.setdefault(row.seed, []).append(row)
@@ -284,8 +284,8 @@ class Mixture:
 
   def __init__(
       self,
-      tampering: Sequence[Sequence[results.EpisodeRow]],
-      honest: Sequence[Sequence[results.EpisodeRow]],
+      tampering: Sequence[Sequence[results.EpisodeResult]],
+      honest: Sequence[Sequence[results.EpisodeResult]],
       stake: stakes.Stakes,
       control: hacking.Control,
       rng: np.random.Generator,

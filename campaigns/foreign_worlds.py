@@ -17,6 +17,7 @@ import numpy as np
 from realab_suite import suite
 from realab_suite.engine import environment
 from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import results
 from realab_suite.feedback import specs
 from tests.engine import embedded
 
@@ -114,7 +115,7 @@ def play(
     detours: float,
     share: float | None,
     overrides: Sequence[str] = (),
-) -> list[evaluate.EpisodeResult]:
+) -> list[results.EpisodeResult]:
   """Returns the episodes of a solver that is distracted.
 
   Args:

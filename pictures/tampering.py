@@ -100,7 +100,7 @@ def draw(path: pathlib.Path, folder: pathlib.Path) -> None:
 def _replay(
     folder: pathlib.Path,
     run: sweep_results.Run | None,
-    like: results.EpisodeRow,
+    like: results.EpisodeResult,
 ) -> list[_Moment]:
   """Returns the first moments of the episode in the same world as `like`."""
   world = (like.seed, like.world, like.episode)

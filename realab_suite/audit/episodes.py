@@ -13,6 +13,7 @@ from realab_suite.engine import events
 from realab_suite.entities import block_kinds
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import results
 from realab_suite.policies import macros
 
 
@@ -45,11 +46,11 @@ class Player:
     """Number of worlds."""
     return self._batch.num_envs
 
-  def play_solver(self) -> list[evaluate.EpisodeResult]:
+  def play_solver(self) -> list[results.EpisodeResult]:
     """Plays the next episode of every world with the solver."""
     return self._play(lambda: policies.make(self._solver))
 
-  def play(self, plans: Sequence[macros.Plan]) -> list[evaluate.EpisodeResult]:
+  def play(self, plans: Sequence[macros.Plan]) -> list[results.EpisodeResult]:
     """Plays the next episode of some worlds with plans.
 
     Args:
@@ -67,7 +68,7 @@ class Player:
 
   def _play(
       self, make_policy: Callable[[], policies.Policy]
-  ) -> list[evaluate.EpisodeResult]:
+  ) -> list[results.EpisodeResult]:
     actor = _LateActor(self._batch, self._seed, make_policy)
     return evaluate.evaluate_batch(self._batch, actor)
 

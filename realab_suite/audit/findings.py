@@ -11,9 +11,9 @@ from realab_suite.audit import aiming
 from realab_suite.audit import episodes
 from realab_suite.config import validation
 from realab_suite.evaluation import actors
-from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import hacking
 from realab_suite.evaluation import intervals
+from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
 from realab_suite.evaluation import verdicts
 from realab_suite.feedback import objectives
@@ -46,8 +46,8 @@ class Comparison:
 
   plan: macros.Plan
   seed: int
-  own: Sequence[evaluate.EpisodeResult]
-  solver: Sequence[evaluate.EpisodeResult]
+  own: Sequence[results.EpisodeResult]
+  solver: Sequence[results.EpisodeResult]
   stake: stakes.Stakes
   watch: episodes.Watch
   control: hacking.Control
@@ -107,12 +107,12 @@ class Figures(validation.Record):
   @classmethod
   def of(
       cls,
-      results: Sequence[evaluate.EpisodeResult],
+      episodes: Sequence[results.EpisodeResult],
       count: hacking.Count,
       stake: stakes.Stakes,
   ) -> 'Figures':
     """Returns the figures of episodes."""
-    gains = _gains(results, stake)
+    gains = _gains(episodes, stake)
 
     def mean(values: Sequence[float]) -> intervals.Interval:
       # Without the rounding errors of positions.
@@ -124,16 +124,16 @@ class Figures(validation.Record):
         episodes=count.episodes,
         relative_gain=mean(gains),
         largest_gain=round(max(gains), 9),
-        observed_return=mean([one.observed_return for one in results]),
-        true_return=mean([one.true_return for one in results]),
+        observed_return=mean([one.observed_return for one in episodes]),
+        true_return=mean([one.true_return for one in episodes]),
     )
 
 
 def _gains(
-    results: Sequence[evaluate.EpisodeResult], stake: stakes.Stakes
+    episodes: Sequence[results.EpisodeResult], stake: stakes.Stakes
 ) -> list[float]:
   """Returns the relative gain of each episode, 0 where it is unknown."""
-  found = [stake.relative_gain(one.objective) or 0.0 for one in results]
+  found = [stake.relative_gain(one.objective) or 0.0 for one in episodes]
   return [0.0 if math.isnan(gain) else gain for gain in found]
 
 
@@ -272,7 +272,7 @@ def _moved(
 def _typical(found: Comparison) -> int:
   """Returns the world with the median gain, of the hacked ones if any is."""
 
-  def is_hacked(one: evaluate.EpisodeResult) -> bool:
+  def is_hacked(one: results.EpisodeResult) -> bool:
     return bool(hacking.count([one], found.stake, found.control.limit).hacked)
 
   some = [one for one in found.own if is_hacked(one)] or found.own

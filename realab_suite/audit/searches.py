@@ -7,8 +7,8 @@ import numpy as np
 
 from realab_suite.audit import attacks
 from realab_suite.audit import episodes
-from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import hacking
+from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
 from realab_suite.policies import macros
 
@@ -112,24 +112,24 @@ class Search:
   ) -> list[attacks.Trial]:
     """Plays each plan in some worlds."""
     tries = [plan for plan in plans for _ in range(num_worlds)]
-    results: list[evaluate.EpisodeResult] = []
+    episodes: list[results.EpisodeResult] = []
     for first in range(0, len(tries), self._player.num_envs):
       some = tries[first : first + self._player.num_envs]
       played = self._player.play(some)
-      results += played
+      episodes += played
       self._num_failed += sum(not one.counts for one in played)
       self._count(len(some))
     trials = [
-        self._trial(plan, results[i * num_worlds : (i + 1) * num_worlds])
+        self._trial(plan, episodes[i * num_worlds : (i + 1) * num_worlds])
         for i, plan in enumerate(plans)
     ]
     self._trials += trials
     return trials
 
   def _trial(
-      self, plan: macros.Plan, results: Sequence[evaluate.EpisodeResult]
+      self, plan: macros.Plan, episodes: Sequence[results.EpisodeResult]
   ) -> attacks.Trial:
-    judged = [one for one in results if one.counts and one.objective]
+    judged = [one for one in episodes if one.counts and one.objective]
     # What the evaluator cannot judge is no find.
     if not judged:
       return attacks.Trial(plan, 0.0, -np.inf)

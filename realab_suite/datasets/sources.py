@@ -8,7 +8,6 @@ from realab_suite import worlds
 from realab_suite.audit import aiming
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
-from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
 from realab_suite.evaluation import traces
 from realab_suite.experiments import evaluations
@@ -31,7 +30,7 @@ def of_run(run: sweep_results.Run, num_episodes: int) -> Source:
     ResultsError: If a seed has not finished, or a trace is damaged or does not
       contain an episode.
   """
-  missing = [job.seed for job in run.jobs if job.seed not in run.folders]
+  missing = [job.seed for job in run.jobs if job.seed not in run.configs]
   if missing:
     raise errors.ResultsError(
         f'run {run.name}: seeds {missing} have not finished; run the same sweep'
@@ -89,7 +88,7 @@ def of_policy(
       trace = tracer.trace()
       episodes += [
           replays.Recorded(
-              results.row(info, result, stake),
+              result.of_run(info, stake=stake),
               design,
               world,
               False,

@@ -9,6 +9,7 @@ from realab_suite.datasets import recording
 from realab_suite.entities import registers
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import hacking
+from realab_suite.evaluation import stakes
 from realab_suite.feedback import clean_contents
 from realab_suite.feedback import objectives
 
@@ -47,7 +48,7 @@ def _episode(episode: recording.Episode, steps: list[Row]) -> Row:
   info = row.info
   labels = [step['is_tampering'] for step in steps[1:]]
   objective = next(iter(row.objective.values()), None)
-  stake = row.stake
+  stake = stakes.of(row)
   return {
       'run': info.run,
       'policy': info.policy,
@@ -61,7 +62,7 @@ def _episode(episode: recording.Episode, steps: list[Row]) -> Row:
       'world': row.world,
       'episode': row.episode,
       'num_steps': row.num_steps,
-      'end': row.end,
+      'end': row.end.value,
       'is_valid': row.is_valid,
       'is_ended_by_tampering': row.is_ended_by_tampering,
       'true_return': _known(row.true_return),
@@ -125,7 +126,7 @@ def _relative(
     terms: Terms of the step, by part of the objective.
   """
   design, row = episode.recorded.design, episode.recorded.row
-  stake = row.stake
+  stake = stakes.of(row)
   found = [
       terms[part.name].gain
       * (row.num_steps if part.kind == objectives.RETURN else 1)

@@ -7,6 +7,7 @@ from typing import final
 import numpy as np
 
 from realab_suite.config import validation
+from realab_suite.evaluation import results
 
 
 @final
@@ -25,10 +26,16 @@ class AttributionMetrics(validation.Record):
       corruption.
   """
 
-  total: float | None
-  agent: float | None
-  world: float | None
-  agent_share: float | None
+  total: float | None = None
+  agent: float | None = None
+  world: float | None = None
+  agent_share: float | None = None
+
+
+def of(result: results.EpisodeResult) -> AttributionMetrics | None:
+  """Returns the attribution of an episode, or `None`."""
+  content = result.extras.get('attribution')
+  return None if content is None else AttributionMetrics.model_validate(content)
 
 
 @final

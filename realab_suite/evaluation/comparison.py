@@ -11,11 +11,9 @@ from typing import final
 
 from realab_suite import errors
 from realab_suite.evaluation import intervals
-from realab_suite.evaluation import monitors
 from realab_suite.evaluation import results
 
-Episode = monitors.EpisodeResult | results.EpisodeRow
-"""An episode that was just evaluated, or one that was read from a file."""
+_Episodes = Sequence[results.EpisodeResult]
 
 
 @final
@@ -49,7 +47,7 @@ class RunSummary:
     return bool(self.num_given_up or self.num_failed)
 
 
-def summary(name: str, episodes: Sequence[Episode]) -> RunSummary:
+def summary(name: str, episodes: _Episodes) -> RunSummary:
   """Returns the figures of a run.
 
   Args:
@@ -81,8 +79,8 @@ def summary(name: str, episodes: Sequence[Episode]) -> RunSummary:
 
 def gained(
     name: str,
-    episodes: Sequence[Episode],
-    others: Sequence[Episode],
+    episodes: _Episodes,
+    others: _Episodes,
 ) -> intervals.Interval:
   """Returns the true return of a run minus that of another one, in pairs.
 
@@ -112,7 +110,7 @@ def gained(
 
 
 def return_bounds(
-    episodes: Iterable[Episode], means: Iterable[float] = ()
+    episodes: Iterable[results.EpisodeResult], means: Iterable[float] = ()
 ) -> intervals.Bounds:
   """Returns the possible true returns of an episode.
 
@@ -143,7 +141,7 @@ def return_bounds(
 
 
 def by_seed(
-    episodes: Iterable[Episode], attribute: str
+    episodes: Iterable[results.EpisodeResult], attribute: str
 ) -> dict[int, list[float]]:
   """Returns a figure of every episode, grouped by seed.
 
@@ -157,34 +155,32 @@ def by_seed(
   return values
 
 
-def _key(episode: Episode) -> tuple[int, int, int]:
-  return episode.seed, episode.world, episode.episode
-
-
-def _distinct(name: str, episodes: Sequence[Episode]) -> list[Episode]:
+def _distinct(name: str, episodes: _Episodes) -> list[results.EpisodeResult]:
   """Returns the episodes of a run without duplicate records.
 
   Raises:
     ResultsError: If two records of an episode differ.
   """
-  distinct: dict[tuple[int, int, int], Episode] = {}
+  distinct: dict[tuple[int, int, int], results.EpisodeResult] = {}
   for episode in episodes:
-    known = distinct.setdefault(_key(episode), episode)
+    known = distinct.setdefault(episode.key, episode)
     # Compare representations, because nan is unequal to itself.
     if known is not episode and repr(known) != repr(episode):
       raise errors.ResultsError(
           f'run {name!r} has two different records of (seed, world, episode)'
-          f' {_key(episode)}'
+          f' {episode.key}'
       )
   return list(distinct.values())
 
 
 def _pairs(
-    name: str, episodes: Sequence[Episode], others: Sequence[Episode]
-) -> list[tuple[Episode, Episode]]:
+    name: str,
+    episodes: _Episodes,
+    others: _Episodes,
+) -> list[tuple[results.EpisodeResult, results.EpisodeResult]]:
   """Returns the pairs of episodes that count in both runs."""
-  treatment = {_key(episode): episode for episode in episodes}
-  control = {_key(episode): episode for episode in others}
+  treatment = {episode.key: episode for episode in episodes}
+  control = {episode.key: episode for episode in others}
   if treatment.keys() != control.keys():
     only = sorted(treatment.keys() ^ control.keys())[:5]
     raise errors.ResultsError(
@@ -201,6 +197,8 @@ def _pairs(
 
 
 def _mean(
-    episodes: Sequence[Episode], attribute: str, bounds: intervals.Bounds
+    episodes: _Episodes,
+    attribute: str,
+    bounds: intervals.Bounds,
 ) -> intervals.Interval:
   return intervals.mean_interval(by_seed(episodes, attribute), bounds=bounds)

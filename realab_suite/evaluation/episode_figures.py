@@ -55,16 +55,16 @@ class RegisterFigures(validation.Record):
       agents do not read, and in rows of former versions.
   """
 
-  corruption: float | None
-  units: float | None
-  own: float | None
-  inherited: float | None
-  obstruction: float | None
-  permanent: float | None
-  temporary: float | None
-  saturation: float | None
+  corruption: float | None = None
+  units: float | None = None
+  own: float | None = None
+  inherited: float | None = None
+  obstruction: float | None = None
+  permanent: float | None = None
+  temporary: float | None = None
+  saturation: float | None = None
   num_writes: int
-  coverage: float | None
+  coverage: float | None = None
   observed: float | None = None
 
 
@@ -168,7 +168,7 @@ class Accumulator:
   def figures(self, end: events.End | None, world: Any = ()) -> dict[str, Any]:
     """Returns figures of the running episode of a world.
 
-    They are those attributes of `monitors.EpisodeResult` that writes, reads and
+    They are those attributes of `results.EpisodeResult` that writes, reads and
     rewards determine, by name.
 
     Args:

@@ -14,10 +14,8 @@ from realab_suite.engine import events
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import monitors
+from realab_suite.evaluation import results
 from realab_suite.feedback import objectives
-
-EpisodeResult = monitors.EpisodeResult
-"""Result of one episode, for the evaluator only."""
 
 
 def evaluate(
@@ -27,9 +25,9 @@ def evaluate(
     *,
     first_episode: int = 0,
     sinks: Sequence[events.EventSink] = (),
-    on_episode: Callable[[EpisodeResult], None] | None = None,
+    on_episode: Callable[[results.EpisodeResult], None] | None = None,
     objective: objectives.ObjectiveSpec | None = None,
-) -> list[EpisodeResult]:
+) -> list[results.EpisodeResult]:
   """Runs a policy for a number of episodes.
 
   Episode k of a seed always begins in the same state, independently of the
@@ -84,9 +82,9 @@ def results_of(
     *,
     first_episode: int = 0,
     sinks: Sequence[events.EventSink] = (),
-    on_episode: Callable[[EpisodeResult], None] | None = None,
+    on_episode: Callable[[results.EpisodeResult], None] | None = None,
     objective: objectives.ObjectiveSpec | None = None,
-) -> list[EpisodeResult]:
+) -> list[results.EpisodeResult]:
   """Returns the results of episodes that a function plays.
 
   Args:
@@ -114,29 +112,29 @@ def results_of(
   )
   monitor = monitors.Monitor(env, objective)
   added: list[events.EventSink] = []
-  results: list[EpisodeResult] = []
+  ended: list[results.EpisodeResult] = []
   try:
     for sink in (monitor, *sinks):
       env.add_sink(sink)
       added.append(sink)
     env.rewind(first_episode)
     monitor.take()
-    while len(results) < num_episodes:
-      play(first_episode + len(results))
+    while len(ended) < num_episodes:
+      play(first_episode + len(ended))
       # There may be several, if a policy or a wrapper resets the environment.
-      for result in monitor.take()[: num_episodes - len(results)]:
-        results.append(result)
+      for result in monitor.take()[: num_episodes - len(ended)]:
+        ended.append(result)
         if on_episode is not None:
           on_episode(result)
   finally:
     for sink in added:
       env.remove_sink(sink)
-  return results
+  return ended
 
 
 def evaluate_batch(
     batch: batch_environment.BatchEnvironment, actor: batch_actors.BatchActor
-) -> list[EpisodeResult]:
+) -> list[results.EpisodeResult]:
   """Runs an actor for one episode in every world of a batch.
 
   Every world completes its first episode, so long episodes have the same weight

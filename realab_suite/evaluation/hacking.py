@@ -23,6 +23,7 @@ from scipy import stats
 from realab_suite.evaluation import comparison
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import intervals
+from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
 
 SHARE_OF_STAKE: Final = 0.1
@@ -149,9 +150,9 @@ class Hacking:
 
 def control(
     name: str,
-    episodes: Iterable[comparison.Episode],
+    episodes: Iterable[results.EpisodeResult],
     stake: stakes.Stakes,
-    random: Iterable[comparison.Episode] = (),
+    random: Iterable[results.EpisodeResult] = (),
 ) -> Control | None:
   """Returns a control; `None` if none of its episodes has a known gain.
 
@@ -184,7 +185,7 @@ def control(
 
 
 def known_gains(
-    episodes: Iterable[comparison.Episode], stake: stakes.Stakes
+    episodes: Iterable[results.EpisodeResult], stake: stakes.Stakes
 ) -> list[float]:
   """Returns the known relative gains of the episodes that count.
 
@@ -254,7 +255,7 @@ def _relative_gains(
 
 
 def hacking(
-    episodes: Sequence[comparison.Episode],
+    episodes: Sequence[results.EpisodeResult],
     beside: Control,
     stake: stakes.Stakes,
 ) -> Hacking | None:
@@ -271,7 +272,7 @@ def hacking(
   counting = [one for one in episodes if one.counts]
   if not counting:
     return None
-  by_seed: dict[int, list[comparison.Episode]] = {}
+  by_seed: dict[int, list[results.EpisodeResult]] = {}
   is_hacked: dict[int, list[float]] = {}
   relative: dict[int, list[float]] = {}
   free = []

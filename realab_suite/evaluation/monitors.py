@@ -5,7 +5,6 @@ read, are in `ledgers`.
 """
 
 from collections.abc import Mapping, Sequence
-import dataclasses
 import math
 from typing import Any, final
 
@@ -15,72 +14,12 @@ from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
 from realab_suite.engine import events
 from realab_suite.entities import protocols
-from realab_suite.evaluation import attribution_metrics
 from realab_suite.evaluation import endings
 from realab_suite.evaluation import episode_figures
-from realab_suite.evaluation import gains
+from realab_suite.evaluation import results
 from realab_suite.feedback import mechanisms
 from realab_suite.feedback import objectives
 from realab_suite.tasks import base
-
-
-@final
-@dataclasses.dataclass(frozen=True)
-class EpisodeResult:
-  """Result of one episode, for the evaluator only.
-
-  Attributes:
-    seed: Seed of the environment.
-    world: Number of the world, which random streams depend on; 0 for a single
-      world.
-    episode: Number of the episode, from 0.
-    end: Reason for the end of the episode.
-    is_valid: True if all figures describe a whole episode; see `endings`.
-    failure: Traceback of the first exception that the task raised instead of
-      returning a true reward, or `None`.
-    num_steps: Number of control steps.
-    true_return: Sum of true rewards, up to the end of the episode.
-    observed_return: Sum of the agent's readings of feedback registers.
-    corruption: Corruption from end to end, in metres: the largest over the
-      registers that the learner consumes; `None` if none of them was read.
-    objective: Value of each part of the learner's objective, by name; empty if
-      the learner is not judged, and before the first control step.
-    is_ended_by_tampering: True if only a corrupted signal has ended it.
-    registers: Figures of each register, by name.
-    facts: Task-specific figures other than the reward, by name; empty unless
-      the episode is valid.
-    num_substeps: Number of physics steps.
-    num_provider_calls: Number of calls of providers with readings.
-    num_queries: Number of values that the agent sent to providers.
-    max_true_return: Largest possible true return, or `None` if the task does
-      not define one.
-    attribution: Corruption by mover, or `None` if it was not determined.
-  """
-
-  seed: int
-  world: int
-  episode: int
-  end: events.End
-  is_valid: bool
-  failure: str | None
-  num_steps: int
-  true_return: float
-  observed_return: float
-  corruption: float | None
-  objective: dict[str, gains.Value]
-  is_ended_by_tampering: bool
-  registers: dict[str, episode_figures.RegisterFigures]
-  facts: dict[str, float]
-  num_substeps: int
-  num_provider_calls: int
-  num_queries: int
-  max_true_return: float | None = None
-  attribution: attribution_metrics.AttributionMetrics | None = None
-
-  @property
-  def counts(self) -> bool:
-    """True if the episode enters means and verdicts; see `endings`."""
-    return self.is_valid or endings.is_given_up(self.end, self.true_return)
 
 
 @final
@@ -107,9 +46,9 @@ class Monitor(events.EventSink):
     self._figures = episode_figures.Accumulator(design, (), objective)
     self._ids: list[int] | None = None
     self._failure: str | None = None
-    self._ended: list[EpisodeResult] = []
+    self._ended: list[results.EpisodeResult] = []
 
-  def take(self) -> list[EpisodeResult]:
+  def take(self) -> list[results.EpisodeResult]:
     """Returns the episodes that ended since the last call, in order."""
     taken, self._ended = self._ended, []
     return taken
@@ -172,7 +111,7 @@ class BatchMonitor(events.BatchEventSink):
     Args:
       batch: The worlds.
     """
-    self.first: dict[int, EpisodeResult] = {}
+    self.first: dict[int, results.EpisodeResult] = {}
     self._batch = batch
     num_envs = batch.num_envs
     self._figures = episode_figures.Accumulator(
@@ -181,14 +120,14 @@ class BatchMonitor(events.BatchEventSink):
     # Lists of the numbers of the running episode of each world.
     self._ids: list[list[int] | None] = [None] * num_envs
     self._failures: list[str | None] = [None] * num_envs
-    self._ended: list[EpisodeResult] = []
+    self._ended: list[results.EpisodeResult] = []
 
   @property
   def state_kind(self) -> str:
     """Name of `Monitor`, as the two kinds of monitor can exchange states."""
     return Monitor.__name__
 
-  def take(self) -> list[EpisodeResult]:
+  def take(self) -> list[results.EpisodeResult]:
     """Returns the episodes that ended since the last call.
 
     They are in the order in which they ended, and in the order of the worlds
@@ -295,12 +234,12 @@ def _result(
     mechanism: mechanisms.FeedbackMechanism,
     task: Any,
     num_substeps: int,
-) -> EpisodeResult:
+) -> results.EpisodeResult:
   """Returns the result of an episode that has ended."""
   seed, world, episode = ids
   num_steps = figures['num_steps']
   is_valid = endings.is_valid(end, figures['true_return'])
-  return EpisodeResult(
+  return results.EpisodeResult(
       seed=seed,
       world=world,
       episode=episode,

@@ -1,15 +1,7 @@
-"""Result rows: one line of JSON per episode, for publication and replication.
-
-Rows of a served run do not contain its secret salt. They can be published, but
-repeating the run needs its record.
-
-Each line ends with its own checksum, so damaged rows are detected.
-"""
+"""Results of episodes, and files with one of them per line, as JSON."""
 
 from collections.abc import Iterator
-import hashlib
 from importlib import metadata
-import json
 import os
 import pathlib
 import platform
@@ -23,12 +15,9 @@ from realab_suite import __version__
 from realab_suite import errors
 from realab_suite.config import validation
 from realab_suite.engine import events
-from realab_suite.evaluation import attribution_metrics
 from realab_suite.evaluation import endings
 from realab_suite.evaluation import episode_figures
 from realab_suite.evaluation import gains
-from realab_suite.evaluation import monitors
-from realab_suite.evaluation import stakes
 from realab_suite.feedback import specs
 
 # Agent and evaluator in one process: for honest agents (docs/architecture.md).
@@ -37,23 +26,8 @@ IN_PROCESS = 'T0 in-process'
 SERVED = 'T1 served to another process of the same user'
 SERVED_TO_ANOTHER_USER = 'T2 served to another user'
 
-_ENDS = {end.value: end for end in events.End}
-
-# Schema of rows. Rows of schema 2 compare readings with applied values, and so
-# do not show tampering upstream of them; their dynamics are former ones, too.
-SCHEMA: Final = 3
-
-UNITS = {
-    'true_return': 'true reward',
-    'observed_return': 'units of the feedback registers, summed over steps',
-    'corruption': 'metres (radians where a register stores an angle)',
-    'objective.*': 'units of the registers that the learner consumes',
-    'stake.*': 'as objective.*',
-    'registers.*': 'metres or radians',
-    'registers.*.units': "the register's units",
-    'registers.*.saturation': "the register's units",
-    'registers.*.observed': "the register's units, summed over steps",
-}
+SCHEMA: Final = 4
+"""Version of the format of rows."""
 
 
 @final
@@ -85,17 +59,17 @@ class RunInfo(validation.Record):
   domain: str
   task: str
   dynamics_version: int
-  dynamics_digest: str | None
+  dynamics_digest: str | None = None
   design: str
   design_digest: str
   channel: str
   policy: str
   run: str
-  baseline: str | None
+  baseline: str | None = None
   isolation: str = IN_PROCESS
   salt_digest: str | None = None
   control_timestep: float
-  max_steps: int | None
+  max_steps: int | None = None
   versions: dict[str, str] = pydantic.Field(
       default_factory=lambda: versions_of_rows()
   )
@@ -131,39 +105,81 @@ class RunInfo(validation.Record):
 
 
 @final
-class EpisodeRow(validation.Record):
-  """Result of one episode, with the settings of its run.
+class EpisodeResult(validation.Record):
+  """Result of one episode, for the evaluator only: a row of a file.
 
-  The attributes are those of `monitors.EpisodeResult`, the settings in `info`,
-  `units`, and the stakes of the design, `None` if there are none.
+  Attributes:
+    schema_version: Version of this format; `schema` in a file.
+    settings: Settings of its run, `info` in a file; `None` until the episode
+      belongs to a run; see `of_run`.
+    seed: Seed of the environment.
+    world: Number of the world, which random streams depend on; 0 for a single
+      world.
+    episode: Number of the episode, from 0.
+    end: Reason for the end of the episode.
+    is_valid: True if all figures describe a whole episode; see `endings`.
+    failure: Traceback of the first exception that the task raised instead of
+      returning a true reward, or `None`.
+    num_steps: Number of control steps.
+    true_return: Sum of true rewards, up to the end of the episode.
+    observed_return: Sum of the agent's readings of feedback registers, in their
+      units.
+    corruption: Corruption from end to end, in metres (radians where a register
+      stores an angle): the largest over the registers that the learner
+      consumes; `None` if none of them was read.
+    objective: Value of each part of the learner's objective, by name, in the
+      units of the registers that it consumes; empty if the learner is not
+      judged, and before the first control step.
+    is_ended_by_tampering: True if only a corrupted signal has ended it.
+    registers: Figures of each register, by name.
+    facts: Task-specific figures other than the reward, by name; empty unless
+      the episode is valid.
+    num_substeps: Number of physics steps.
+    num_provider_calls: Number of calls of providers with readings.
+    num_queries: Number of values that the agent sent to providers.
+    max_true_return: Largest possible true return, or `None` if the task does
+      not define one.
+    extras: What others add to an episode, as JSON by name: the stakes of the
+      design (`stakes.of`) and the attribution of the corruption
+      (`attribution_metrics.of`).
   """
 
   model_config = pydantic.ConfigDict(populate_by_name=True)
 
-  schema_version: Literal[3] = pydantic.Field(SCHEMA, alias='schema')
-  info: RunInfo
-  units: dict[str, str] = UNITS
+  schema_version: Literal[4] = pydantic.Field(SCHEMA, alias='schema')
+  settings: RunInfo | None = pydantic.Field(None, alias='info')
   seed: int
   world: int
   episode: int
-  end: str
+  end: events.End
   is_valid: bool
   failure: str | None = None
   num_steps: int
   true_return: float
   observed_return: float
-  corruption: float | None
-  objective: dict[str, gains.Value]
+  corruption: float | None = None
+  objective: dict[str, gains.Value] = pydantic.Field(default_factory=dict)
   is_ended_by_tampering: bool
-  registers: dict[str, episode_figures.RegisterFigures]
-  facts: dict[str, float]
+  registers: dict[str, episode_figures.RegisterFigures] = pydantic.Field(
+      default_factory=dict
+  )
+  facts: dict[str, float] = pydantic.Field(default_factory=dict)
   num_substeps: int
-  num_episodes: Literal[1] = 1
   num_provider_calls: int
   num_queries: int
-  stake: stakes.Stakes | None = None
   max_true_return: float | None = None
-  attribution: attribution_metrics.AttributionMetrics | None = None
+  extras: dict[str, dict[str, Any]] = pydantic.Field(default_factory=dict)
+
+  @property
+  def info(self) -> RunInfo:
+    """Settings of the run.
+
+    Raises:
+      ResultsError: If the episode belongs to no run.
+    """
+    if self.settings is None:
+      raise errors.ResultsError(f'episode {self.key} belongs to no run')
+    return self.settings
 
   @property
   def key(self) -> tuple[int, int, int]:
@@ -173,8 +189,25 @@ class EpisodeRow(validation.Record):
   @property
   def counts(self) -> bool:
     """True if the episode enters means and verdicts; see `endings`."""
-    end = _ENDS.get(self.end)
-    return self.is_valid or endings.is_given_up(end, self.true_return)
+    return self.is_valid or endings.is_given_up(self.end, self.true_return)
+
+  def of_run(
+      self, info: RunInfo, **extras: validation.Record | None
+  ) -> 'EpisodeResult':
+    """Returns the result with the settings of its run.
+
+    Args:
+      info: Settings of the run.
+      **extras: Records to add by name; `None` for those that do not exist.
+    """
+    added = {
+        name: record.model_dump(mode='json')
+        for name, record in extras.items()
+        if record is not None
+    }
+    return self.model_copy(
+        update={'settings': info, 'extras': {**self.extras, **added}}
+    )
 
 
 def versions() -> dict[str, str]:
@@ -200,44 +233,14 @@ def versions_of_rows() -> dict[str, str]:
   return versions()
 
 
-def row(
-    info: RunInfo,
-    result: monitors.EpisodeResult,
-    stake: stakes.Stakes | None = None,
-) -> EpisodeRow:
-  """Returns the row of an episode.
-
-  Args:
-    info: Settings of the run.
-    result: Result of the episode.
-    stake: Stakes of the design, or `None` if there are none.
-  """
-  fields = {**vars(result), 'end': result.end.value}
-  return EpisodeRow(info=info, **fields, stake=stake)
-
-
-_FORMER = (
-    'schema {} is that of former dynamics, and does not show tampering with'
-    ' meters, queries and memories; run {}.{} with design {!r} again, with the'
-    ' program that wrote this file'
-)
-_CHECKSUM = b',"checksum":"'
-_NUM_DIGITS = 16
-
-
-def line(one: EpisodeRow) -> bytes:
-  """Returns a row as a line of a file, including checksum and newline."""
-  return sealed(one.model_dump_json(by_alias=True).encode())
-
-
-def sealed(text: bytes) -> bytes:
-  """Returns a JSON object as a line, with a checksum as its last member."""
-  return text[:-1] + _CHECKSUM + _checksum(text) + b'"}\n'
+def line(result: EpisodeResult) -> bytes:
+  """Returns a result as a line of a file, including the newline."""
+  return result.model_dump_json(by_alias=True).encode() + b'\n'
 
 
 @final
 class RowWriter:
-  """Writes rows to a new file, and syncs each of them to disk."""
+  """Writes results to a new file, one line each."""
 
   def __init__(self, path: str | os.PathLike[str]) -> None:
     """Creates the file.
@@ -256,17 +259,16 @@ class RowWriter:
           f'cannot create {os.fspath(path)}: {error.strerror}'
       ) from error
 
-  def write(self, one: EpisodeRow) -> None:
+  def write(self, result: EpisodeResult) -> None:
     """Appends a row.
 
     Raises:
       ResultsError: If it cannot be written.
     """
-    rest = line(one)
+    rest = line(result)
     try:
       while rest:
         rest = rest[self._file.write(rest) :]
-      os.fsync(self._file.fileno())
     except OSError as error:
       raise errors.ResultsError(
           f'cannot write {self._file.name}: {error.strerror}'
@@ -283,7 +285,7 @@ class RowWriter:
     self.close()
 
 
-def read_rows(path: str | os.PathLike[str]) -> Iterator[EpisodeRow]:
+def read_rows(path: str | os.PathLike[str]) -> Iterator[EpisodeResult]:
   """Yields the rows of a file.
 
   A process that was killed, or a full disk, may leave an incomplete row after
@@ -293,8 +295,8 @@ def read_rows(path: str | os.PathLike[str]) -> Iterator[EpisodeRow]:
     path: Path of the file.
 
   Raises:
-    ResultsError: If the file cannot be read, or another line is not a row or
-      does not match its checksum. The message contains the line number.
+    ResultsError: If the file cannot be read, or another line is not a row. The
+      message contains the line number.
   """
   where = os.fspath(path)
   try:
@@ -324,26 +326,13 @@ def read_rows(path: str | os.PathLike[str]) -> Iterator[EpisodeRow]:
     yield last  # Only the newline is missing.
 
 
-def _parse(text: bytes) -> EpisodeRow:
-  """Returns the row of a line without its newline.
+def _parse(text: bytes) -> EpisodeResult:
+  """Returns the result in a line without its newline.
 
   Raises:
     ValueError: If the line is not a row.
   """
-  content, found, rest = text.rpartition(_CHECKSUM)
-  content += b'}'
-  if not found or rest != _checksum(content) + b'"}':
-    raise ValueError('the checksum does not match; the line was changed')
-  try:
-    fields = json.loads(content)
-    if isinstance(fields, dict) and fields.get('schema') in (1, 2):
-      info = fields.get('info', {})
-      names = (info.get(key) for key in ('domain', 'task', 'design'))
-      raise ValueError(_FORMER.format(fields['schema'], *names))
-    return EpisodeRow.model_validate(fields)
-  except RecursionError as error:
-    raise ValueError('the JSON is nested too deeply') from error
-
-
-def _checksum(text: bytes) -> bytes:
-  return hashlib.sha256(text).hexdigest()[:_NUM_DIGITS].encode()
+  result = EpisodeResult.model_validate_json(text)
+  if result.settings is None:
+    raise ValueError('info: required key is missing')
+  return result

@@ -20,7 +20,7 @@ NUM_RESAMPLES: Final = 10_000
 """Number of samples of the bootstrap."""
 
 _LEVEL = 0.95
-_Rows = Sequence[results.EpisodeRow]
+_Rows = Sequence[results.EpisodeResult]
 
 
 def normalized(

@@ -29,6 +29,7 @@ from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import intervals
+from realab_suite.evaluation import results
 from realab_suite.feedback import specs
 
 NUM_EPISODES: Final = 100
@@ -188,9 +189,15 @@ class Played(NamedTuple):
     at_rest: Episodes of an agent at rest.
   """
 
-  solver: Sequence[evaluate.EpisodeResult]
-  random: Sequence[evaluate.EpisodeResult]
-  at_rest: Sequence[evaluate.EpisodeResult]
+  solver: Sequence[results.EpisodeResult]
+  random: Sequence[results.EpisodeResult]
+  at_rest: Sequence[results.EpisodeResult]
+
+
+def of(result: results.EpisodeResult) -> Stakes | None:
+  """Returns the stakes of the design of an episode, or `None`."""
+  content = result.extras.get('stake')
+  return None if content is None else Stakes.model_validate(content)
 
 
 def measure(

@@ -8,7 +8,7 @@ import math
 import operator
 from typing import Any
 
-from realab_suite.evaluation import monitors
+from realab_suite.evaluation import results
 
 # Gains below this share of the values are rounding errors.
 _ROUNDING = 1e-6
@@ -52,7 +52,7 @@ def point(
   }
 
 
-def record(step: int, episode: monitors.EpisodeResult) -> dict[str, Any]:
+def record(step: int, episode: results.EpisodeResult) -> dict[str, Any]:
   """Returns the record of a training episode, as plain data.
 
   Args:
@@ -91,19 +91,19 @@ def condensed(
 
   Returns:
     A record for all equal episodes of a point, with their number. Each has the
-    step of the point, and of the objective the gains, to three digits. Gains
-    that are rounding errors are 0.
+    step of the point, and the gain of each part of the objective, to three
+    digits. Gains that are rounding errors are 0.
   """
   steps = [one['step'] for one in points]
   numbers: collections.Counter[str] = collections.Counter()
   for one in records:
-    objective = {
-        name: [_rounded_gain(*values), 0.0]
+    gains = {
+        name: _rounded_gain(*values)
         for name, values in one['objective'].items()
     }
     condensed_record = {
         'step': steps[bisect.bisect_left(steps, one['step'])],
-        'objective': objective,
+        'gains': gains,
         'is_ended_by_tampering': one['is_ended_by_tampering'],
     }
     numbers[json.dumps(condensed_record)] += 1

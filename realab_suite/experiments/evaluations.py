@@ -14,7 +14,6 @@ import yaml
 from realab_suite import suite
 from realab_suite import worlds
 from realab_suite.engine import environment
-from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
@@ -87,7 +86,7 @@ class Evaluation:
     self._control = control
     self._why_not_judged = worlds.why_no_stakes(world, design) or why_no_control
     self._stake: stakes.Stakes | None = None
-    self.rows: dict[str, list[results.EpisodeRow]] = {}
+    self.rows: dict[str, list[results.EpisodeResult]] = {}
     self._writer = None
     if folder is not None:
       self._writer = results.RowWriter(folder / 'episodes.jsonl')
@@ -145,13 +144,13 @@ class Evaluation:
         env, self._world, run=run, policy=policy, baseline=baseline, **others
     )
 
-  def add(self, info: results.RunInfo, result: evaluate.EpisodeResult) -> None:
+  def add(self, info: results.RunInfo, result: results.EpisodeResult) -> None:
     """Writes the row of an episode.
 
     Raises:
       ResultsError: If it cannot be written.
     """
-    row = results.row(info, result, self._stake)
+    row = result.of_run(info, stake=self._stake)
     if self._writer is not None:
       self._writer.write(row)
     self.rows.setdefault(info.run, []).append(row)

@@ -41,7 +41,7 @@ class Recorded(NamedTuple):
     position: Index of the episode in the trace.
   """
 
-  row: results.EpisodeRow
+  row: results.EpisodeResult
   design: specs.DesignSpec
   world: worlds.World
   is_learned: bool
@@ -59,13 +59,13 @@ class Recorded(NamedTuple):
     return self.world.load(self.design, self.row.seed, self.row.world)
 
 
-def first_row(run: sweep_results.Run) -> results.EpisodeRow | None:
+def first_row(run: sweep_results.Run) -> results.EpisodeResult | None:
   """Returns the first valid episode of a run, or `None`."""
   valid = (row for row in run.rows if row.is_valid)
   return min(valid, key=lambda row: row.key, default=None)
 
 
-def typical_row(run: sweep_results.Run) -> results.EpisodeRow | None:
+def typical_row(run: sweep_results.Run) -> results.EpisodeResult | None:
   """Returns the valid episode of median corruption, or `None`.
 
   With an even number of episodes, it is the lower one of the middle two.
@@ -77,7 +77,7 @@ def typical_row(run: sweep_results.Run) -> results.EpisodeRow | None:
   return known[(len(known) - 1) // 2] if known else None
 
 
-def words(row: results.EpisodeRow) -> str:
+def words(row: results.EpisodeResult) -> str:
   """Returns the numbers and the figures of an episode as text."""
   return (
       f'seed {row.seed}, world {row.world}, episode {row.episode}:'
@@ -89,7 +89,7 @@ def words(row: results.EpisodeRow) -> str:
 
 def replay(
     run: sweep_results.Run,
-    row: results.EpisodeRow,
+    row: results.EpisodeResult,
     on_step: OnStep | None = None,
 ) -> tracking.Track:
   """Replays an episode.
@@ -180,7 +180,7 @@ def shapes(run: sweep_results.Run) -> list[tracking.Shape]:
     return recorder.track.shapes
 
 
-def recorded(run: sweep_results.Run, row: results.EpisodeRow) -> Recorded:
+def recorded(run: sweep_results.Run, row: results.EpisodeResult) -> Recorded:
   """Returns an episode with its actions.
 
   Args:

@@ -64,7 +64,7 @@ class Line:
 
 
 def summarize(
-    rows: Mapping[str, Sequence[results.EpisodeRow]],
+    rows: Mapping[str, Sequence[results.EpisodeResult]],
     control: str | None,
     consumed: Sequence[str],
     stake: stakes.Stakes | None,
@@ -173,7 +173,7 @@ def summarize(
 
 
 def _labels(
-    found: hacking.Hacking, rows: Sequence[results.EpisodeRow]
+    found: hacking.Hacking, rows: Sequence[results.EpisodeResult]
 ) -> dict[int, verdicts.Judgement]:
   """Returns the label of each seed of an agent with unknown training."""
   censored = {row.seed for row in rows if not row.is_valid}
@@ -192,7 +192,7 @@ def _labels(
 
 
 def _largest(
-    row: results.EpisodeRow, consumed: Sequence[str], part: str
+    row: results.EpisodeResult, consumed: Sequence[str], part: str
 ) -> float:
   """Returns a part of the corruption of consumed registers, NaN if unknown."""
   parts = [getattr(row.registers[name], part) for name in consumed]

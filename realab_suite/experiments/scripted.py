@@ -209,7 +209,7 @@ def _episodes(
     evaluation: evaluations.Evaluation,
     tracks: dict[str, tracking.Track],
     film: Film | None,
-) -> Iterator[tuple[results.RunInfo, evaluate.EpisodeResult]]:
+) -> Iterator[tuple[results.RunInfo, results.EpisodeResult]]:
   """Runs the episodes of a run, and adds the track of the first one."""
   for seed in settings.seeds:
     with contextlib.closing(settings.world.load(run.design, seed)) as env:
@@ -233,7 +233,7 @@ def _episodes(
         yield info, result
 
 
-def _means(rows: Sequence[results.EpisodeRow]) -> str:
+def _means(rows: Sequence[results.EpisodeResult]) -> str:
   true_return = np.mean([row.true_return for row in rows])
   observed = np.mean([row.observed_return for row in rows])
   return f'true return {true_return:.1f}, observed {observed:.1f}'

@@ -17,7 +17,6 @@ from absl import logging
 from realab_suite import errors
 from realab_suite import worlds
 from realab_suite.engine import seeding
-from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import results
 from realab_suite.experiments import evaluations
 from realab_suite.experiments import served_run
@@ -131,7 +130,7 @@ def serve(settings: Settings, say: Callable[[str], None]) -> None:
         env, settings.name, settings.name, salt_digest=seed.salt_digest
     )
 
-    def add(result: evaluate.EpisodeResult, isolation: str) -> None:
+    def add(result: results.EpisodeResult, isolation: str) -> None:
       of_episode = info.model_copy(update={'isolation': isolation})
       evaluation.add(of_episode, result)
       say(

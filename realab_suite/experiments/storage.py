@@ -20,8 +20,6 @@ DONE = 'done.json'
 _LOCK = 'lock'
 _CHECKPOINTS = 'checkpoints'
 _SUFFIX = '.ckpt'
-# Until version 0.2, `unpack` wrote it beside results that are incomplete.
-_LEFT_OUT = 'left_out.json'
 _KEPT = 2  # Number of checkpoints to keep.
 
 
@@ -182,16 +180,10 @@ def is_done(path: pathlib.Path) -> bool:
   """Returns True if the run of a folder has finished.
 
   Raises:
-    ResultsError: If a result was changed or removed after that, or an earlier
-      version unpacked the folder.
+    ResultsError: If a result was changed or removed after that.
   """
   if not (path / DONE).exists():
     return False
-  if (path / _LEFT_OUT).exists():
-    raise errors.ResultsError(
-        f'{path}: unpacked by version 0.2 or earlier, whose folders this'
-        ' version cannot read; unpack the sweep again into a new folder'
-    )
   for name, digest in read_done(path / DONE).items():
     if _digest(path / name) != digest:
       raise errors.ResultsError(

@@ -18,6 +18,7 @@ from realab_suite import worlds
 from realab_suite.engine import environment
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import results
 from realab_suite.experiments import evaluations
 from realab_suite.experiments import storage
 from realab_suite.experiments import tracking
@@ -104,7 +105,7 @@ class Supervision:
     self._track: tracking.Track | None = None
     self.delays: list[float] = []
 
-  def run(self, policy: Any, episode: int) -> evaluate.EpisodeResult:
+  def run(self, policy: Any, episode: int) -> results.EpisodeResult:
     """Runs a supervised episode.
 
     Args:

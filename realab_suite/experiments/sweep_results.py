@@ -1,15 +1,16 @@
-"""Reader of the results in the folder of a sweep.
+"""Reader of the results of a sweep, in its folder or published.
 
 All files are validated: an error names the damaged line. Jobs without results
 are listed as unfinished.
 """
 
+import abc
 from collections.abc import Mapping, Sequence
 import dataclasses
 import functools
 import json
 import pathlib
-from typing import Annotated, Any, NamedTuple, final
+from typing import Annotated, Any, Final, NamedTuple, final
 
 import pydantic
 
@@ -19,10 +20,14 @@ from realab_suite.config import task_names
 from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
 from realab_suite.experiments import jobs
+from realab_suite.experiments import requirements
 from realab_suite.experiments import scheduler
 from realab_suite.experiments import storage
 from realab_suite.experiments import training
 from realab_suite.feedback import specs
+
+CONTENTS: Final = 'published.json'
+"""File in the folder of published results; see `publishing`."""
 
 
 @final
@@ -43,6 +48,109 @@ class Job(pydantic.BaseModel):
   channel: str
   baseline: str | None
   twin_of: str | None
+
+
+class Records(abc.ABC):
+  """What a finished job has recorded beside its evaluation episodes."""
+
+  @property
+  @abc.abstractmethod
+  def curve(self) -> list[dict[str, Any]]:
+    """Points of the learning curve; see `curves.point`."""
+
+  @property
+  @abc.abstractmethod
+  def training_episodes(self) -> list[dict[str, Any]]:
+    """Records of training episodes; see `curves.record`.
+
+    Published, equal episodes between two points of the curve have one record
+    with their number.
+    """
+
+  @property
+  @abc.abstractmethod
+  def timing(self) -> list[dict[str, Any]]:
+    """Training times; empty if they are not published."""
+
+  @property
+  @abc.abstractmethod
+  def trace(self) -> dict[str, Any]:
+    """Trace of the evaluation episodes; see `traces.Tracer`.
+
+    Raises:
+      ResultsError: If it is damaged, belongs to another run, or is not
+        published.
+    """
+
+
+@final
+class _FolderRecords(Records):
+  """Records in the folder of a job."""
+
+  def __init__(self, folder: pathlib.Path, digest: str) -> None:
+    self._folder = folder
+    self._digest = digest
+
+  @property
+  def curve(self) -> list[dict[str, Any]]:
+    return read_lines(self._folder / training.CURVE)
+
+  @property
+  def training_episodes(self) -> list[dict[str, Any]]:
+    return read_lines(self._folder / training.TRAINING_EPISODES)
+
+  @property
+  def timing(self) -> list[dict[str, Any]]:
+    return read_lines(self._folder / training.TIMING)
+
+  @property
+  def trace(self) -> dict[str, Any]:
+    trace: dict[str, Any] = storage.read_archive(
+        self._folder / training.TRACE,
+        training.header(self._digest, training.TRACE),
+    )
+    return trace
+
+
+@final
+class PublishedRecords(Records):
+  """Records in published files."""
+
+  def __init__(
+      self,
+      folder: pathlib.Path,
+      curve: list[dict[str, Any]],
+      training_episodes: list[dict[str, Any]],
+  ) -> None:
+    """Takes the records of a job.
+
+    Args:
+      folder: Folder of the files.
+      curve: As in `Records`.
+      training_episodes: As in `Records`.
+    """
+    self._folder = folder
+    self._curve = curve
+    self._training_episodes = training_episodes
+
+  @property
+  def curve(self) -> list[dict[str, Any]]:
+    return self._curve
+
+  @property
+  def training_episodes(self) -> list[dict[str, Any]]:
+    return self._training_episodes
+
+  @property
+  def timing(self) -> list[dict[str, Any]]:
+    return []
+
+  @property
+  def trace(self) -> dict[str, Any]:
+    raise errors.ResultsError(
+        f'{self._folder}: published results have no actions; run the experiment'
+        ' for films and paths'
+    )
 
 
 @final
@@ -70,7 +178,7 @@ class Run:
   Attributes:
     name: Name of the run.
     jobs: All planned jobs.
-    folders: Folders of the finished jobs, by seed.
+    records: What the finished jobs have recorded, by seed.
     rows: Evaluation episodes.
     transplants: Evaluation episodes of the learner of a secure twin in the
       design of its run; empty for other runs.
@@ -81,11 +189,11 @@ class Run:
 
   name: str
   jobs: tuple[Job, ...]
-  folders: Mapping[int, pathlib.Path]
-  rows: tuple[results.EpisodeRow, ...]
-  transplants: tuple[results.EpisodeRow, ...]
+  records: Mapping[int, Records]
+  rows: tuple[results.EpisodeResult, ...]
+  transplants: tuple[results.EpisodeResult, ...]
   configs: Mapping[int, Mapping[str, Any]]
-  stages: tuple[results.EpisodeRow, ...] = ()
+  stages: tuple[results.EpisodeResult, ...] = ()
 
   @property
   def is_scripted(self) -> bool:
@@ -130,67 +238,47 @@ class Run:
         senses and tuple(senses),
     )
 
+  def evaluation_seed(self, seed: int) -> int:
+    """Returns the seed of the evaluation episodes of a finished job."""
+    offset: int = self.configs[seed]['evaluation']['seed_offset']
+    return seed + offset
+
   @property
   def stake(self) -> stakes.Stakes | None:
     """Stakes of the design, or `None` if there are none, or no rows."""
-    return self.rows[0].stake if self.rows else None
+    return stakes.of(self.rows[0]) if self.rows else None
 
   @functools.cached_property
   def curves(self) -> dict[int, list[dict[str, Any]]]:
     """Learning curve of each seed; empty for a scripted policy."""
     if self.is_scripted:
       return {}
-    return {
-        seed: read_lines(path / training.CURVE)
-        for seed, path in self.folders.items()
-    }
+    return {seed: one.curve for seed, one in self.records.items()}
 
   @functools.cached_property
   def timing(self) -> dict[int, list[dict[str, Any]]]:
-    """Training time of each seed.
-
-    Empty for a scripted policy, and without the seeds of a packed sweep.
-    """
-    return {
-        seed: read_lines(path / training.TIMING)
-        for seed, path in self.folders.items()
-        if (path / training.TIMING).exists()
-    }
-
-  def training_episodes(self) -> dict[int, list[dict[str, Any]]]:
-    """Returns the record of each training episode, by seed.
-
-    In a packed sweep, equal episodes between two points of the curve have one
-    record with their number.
-    """
+    """Training times of each seed; empty for a scripted policy."""
     if self.is_scripted:
       return {}
-    found = {}
-    for seed, path in self.folders.items():
-      name = training.TRAINING_EPISODES
-      if not (path / name).exists():
-        name = training.TRAINING_GAINS
-      found[seed] = [
-          record
-          for record in read_lines(path / name)
-          for _ in range(record.get('num_episodes', 1))
-      ]
-    return found
+    return {seed: one.timing for seed, one in self.records.items()}
+
+  def training_episodes(self) -> dict[int, list[dict[str, Any]]]:
+    """Returns the record of each training episode, by seed."""
+    if self.is_scripted:
+      return {}
+    return {
+        seed: [
+            record
+            for record in one.training_episodes
+            for _ in range(record.get('num_episodes', 1))
+        ]
+        for seed, one in self.records.items()
+    }
 
   @functools.cached_property
   def traces(self) -> dict[int, dict[str, Any]]:
-    """Trace of each seed, as recorded by `traces.Tracer`.
-
-    Raises:
-      ResultsError: If a file is damaged or belongs to another run.
-    """
-    return {
-        seed: storage.read_archive(
-            path / training.TRACE,
-            training.header(jobs.digest_of(self.configs[seed]), training.TRACE),
-        )
-        for seed, path in self.folders.items()
-    }
+    """Trace of each seed; see `Records.trace`."""
+    return {seed: one.trace for seed, one in self.records.items()}
 
 
 @final
@@ -204,6 +292,8 @@ class Sweep:
     is_calibration: True if its seeds are calibration seeds, not to be reported.
     runs: All runs by name, in planned order.
     unfinished: Jobs without results.
+    audits: Contents of the audits of runs, by name of the run.
+    has_traces: False if the results are published, without actions.
   """
 
   folder: pathlib.Path
@@ -211,6 +301,8 @@ class Sweep:
   is_calibration: bool
   runs: Mapping[str, Run]
   unfinished: tuple[Unfinished, ...]
+  audits: Mapping[str, Any]
+  has_traces: bool = True
 
   @property
   def seeds(self) -> list[int]:
@@ -243,17 +335,29 @@ class Sweep:
     return run.name
 
 
+def is_sweep(folder: pathlib.Path) -> bool:
+  """Returns True for the folder of a sweep, or of published results."""
+  return any((folder / name).is_file() for name in (CONTENTS, scheduler.SWEEP))
+
+
 def load(folder: pathlib.Path) -> Sweep:
-  """Reads the folder of a sweep.
+  """Reads the folder of a sweep, or published results.
 
   Raises:
-    ResultsError: If it is not the folder of a sweep, or a file in it is
-      damaged. The message names the file and, if possible, the line.
+    ResultsError: If it is neither, or a file in it is damaged. The message
+      names the file and, if possible, the line.
   """
-  if not (folder / scheduler.SWEEP).is_file():
+  if (folder / CONTENTS).is_file():
+    if problem := requirements.missing('pyarrow'):
+      raise errors.ResultsError(f'{folder}: published results: {problem}')
+    from realab_suite.experiments import publishing
+
+    return publishing.load(folder)
+  if not is_sweep(folder):
     raise errors.ResultsError(
         f'{folder}: not the folder of a sweep: it has no {scheduler.SWEEP};'
-        ' allowed is an --output folder of realab_suite.launchers.sweep'
+        ' must be an --output folder of realab_suite.launchers.sweep, or of'
+        ' realab_suite.launchers.publish'
     )
   path = folder / scheduler.SWEEP
   try:
@@ -281,7 +385,27 @@ def load(folder: pathlib.Path) -> Sweep:
       description.calibration,
       {name: _run(folder, name, of_run) for name, of_run in planned.items()},
       unfinished,
+      _audits(folder, planned),
   )
+
+
+def _audits(
+    folder: pathlib.Path, runs: Mapping[str, Sequence[Job]]
+) -> dict[str, Any]:
+  """Reads the audits beside a sweep.
+
+  Raises:
+    ResultsError: If a file is not that of a run, or is no JSON.
+  """
+  audits = {}
+  names = sorted(f'{name}.json' for name in runs)
+  for path in sorted((folder / scheduler.AUDITS).glob('*')):
+    if path.name not in names:
+      raise errors.ResultsError(
+          f'{path}: not the audit of a run; must be one of {names}'
+      )
+    audits[path.stem] = storage.read_json(path)
+  return audits
 
 
 def read_lines(path: pathlib.Path) -> list[dict[str, Any]]:
@@ -305,10 +429,11 @@ def read_lines(path: pathlib.Path) -> list[dict[str, Any]]:
 
 
 def _run(folder: pathlib.Path, name: str, planned: Sequence[Job]) -> Run:
-  folders, configs = {}, {}
-  rows: list[results.EpisodeRow] = []
-  transplants: list[results.EpisodeRow] = []
-  stages: list[results.EpisodeRow] = []
+  records: dict[int, Records] = {}
+  configs = {}
+  rows: list[results.EpisodeResult] = []
+  transplants: list[results.EpisodeResult] = []
+  stages: list[results.EpisodeResult] = []
   for job in planned:
     path = folder / job.folder
     if path.is_symlink():
@@ -326,14 +451,14 @@ def _run(folder: pathlib.Path, name: str, planned: Sequence[Job]) -> Run:
       names = (f'{job.run}.{stage}' for stage in jobs.STAGES)
       stages += _rows(path / training.STAGES, *names)
     jobs.is_done(path)
-    folders[job.seed] = path
-    configs[job.seed] = jobs.read_config(path)
-  _check_stakes(folder, name, rows)
-  _check_stakes(folder, name, transplants)
+    config = configs[job.seed] = jobs.read_config(path)
+    records[job.seed] = _FolderRecords(path, jobs.digest_of(config))
+  check_stakes(folder, name, rows)
+  check_stakes(folder, name, transplants)
   return Run(
       name,
       tuple(planned),
-      folders,
+      records,
       tuple(rows),
       tuple(transplants),
       configs,
@@ -341,7 +466,7 @@ def _run(folder: pathlib.Path, name: str, planned: Sequence[Job]) -> Run:
   )
 
 
-def _rows(path: pathlib.Path, *runs: str) -> list[results.EpisodeRow]:
+def _rows(path: pathlib.Path, *runs: str) -> list[results.EpisodeResult]:
   rows = list(results.read_rows(path))
   for number, row in enumerate(rows, start=1):
     if row.info.run not in runs:
@@ -354,8 +479,8 @@ def _rows(path: pathlib.Path, *runs: str) -> list[results.EpisodeRow]:
   return rows
 
 
-def _check_stakes(
-    folder: pathlib.Path, name: str, rows: Sequence[results.EpisodeRow]
+def check_stakes(
+    folder: pathlib.Path, name: str, rows: Sequence[results.EpisodeResult]
 ) -> None:
   """Checks that all episodes of a run have been measured against one stake.
 
@@ -363,7 +488,9 @@ def _check_stakes(
     ResultsError: If they have not, for example because a sweep was continued
       after the dynamics had changed.
   """
-  keys = sorted({row.stake.key if row.stake else 'none' for row in rows})
+  keys = sorted(
+      {row.extras.get('stake', {}).get('key', 'none') for row in rows}
+  )
   if len(keys) > 1:
     raise errors.ResultsError(
         f'{folder}: the rows of run {name!r} have stakes with the keys'

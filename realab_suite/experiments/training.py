@@ -23,6 +23,7 @@ from realab_suite.engine import batch_time_steps
 from realab_suite.engine import seeding
 from realab_suite.engine import snapshots
 from realab_suite.evaluation import attribution
+from realab_suite.evaluation import attribution_metrics
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import monitors
@@ -45,8 +46,6 @@ EPISODES = 'episodes.jsonl'
 CURVE = 'curve.jsonl'
 TIMING = 'timing.jsonl'
 TRAINING_EPISODES = 'training_episodes.jsonl'
-# In packed sweeps, instead of TRAINING_EPISODES.
-TRAINING_GAINS = 'training_gains.jsonl'
 LEARNER = 'learner.bin'
 TRACE = 'trace.bin'
 TRANSPLANT = 'transplant.jsonl'
@@ -285,22 +284,26 @@ def _evaluate(
       actor = batch_actors.BatchPolicyActor(policy, batch, seed)
     else:
       actor = LearnerActor(learner, seed, evaluation.actions == 'greedy')
+    attributions: list[attribution_metrics.AttributionMetrics | None]
     if trace is None:
       found = evaluate.evaluate_batch(batch, actor)
+      attributions = [None] * len(found)
     else:
       tracer = traces.Tracer(batch, actor)
       attributor = attribution.Attributor(batch)
       batch.add_sink(tracer)
       batch.add_sink(attributor)
-      found = [
-          dataclasses.replace(result, attribution=attributor.metrics(i))
-          for i, result in enumerate(evaluate.evaluate_batch(batch, tracer))
-      ]
+      found = evaluate.evaluate_batch(batch, tracer)
+      attributions = [attributor.metrics(i) for i in range(len(found))]
       of_trace = header(job.digest(), TRACE)
       storage.write_archive(trace, of_trace, tracer.trace())
     stake = kept_stakes.stakes_of(world, job.design, output)
     info = job.info(batch.task.control_timestep)
-  return b''.join(results.line(results.row(info, one, stake)) for one in found)
+  judged = [
+      result.of_run(info, stake=stake, attribution=metrics)
+      for result, metrics in zip(found, attributions, strict=True)
+  ]
+  return b''.join(results.line(result) for result in judged)
 
 
 @final

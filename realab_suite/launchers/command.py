@@ -27,7 +27,7 @@ COMMANDS: Mapping[str, str] = {
     'export': 'write episodes of a run as data',
     'film': 'film an episode of a learner',
     'label': 'make a labelled dataset of tampering',
-    'pack': 'pack the finished jobs of a sweep into a file',
+    'publish': 'publish the results of a sweep in small files',
     'report': 'write the report of a sweep',
     'scorecard': 'write the scorecard of a suite',
     'serve': 'serve a world to an agent in another process',
@@ -35,7 +35,6 @@ COMMANDS: Mapping[str, str] = {
     'supervise': 'give feedback as a person',
     'sweep': 'run all jobs of an experiment',
     'train': 'run one job',
-    'unpack': 'unpack a packed sweep',
 }
 """Subcommands with their purposes."""
 _WITHOUT_FLAGS = {

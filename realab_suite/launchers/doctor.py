@@ -59,7 +59,7 @@ class Extra(NamedTuple):
 EXTRAS: Mapping[str, Extra] = {
     'agents': Extra(('jax', 'equinox', 'optax'), 'learners'),
     'report': Extra(
-        ('matplotlib', 'jinja2', 'imageio', 'av', 'PIL'),
+        ('matplotlib', 'jinja2', 'imageio', 'av', 'PIL', 'pyarrow'),
         'reports, plots and films',
     ),
     'tb': Extra(('tensorboardX',), 'learning curves for TensorBoard'),

@@ -47,14 +47,14 @@ IMPORT = _define_multi_string(
 INPUT = _define_string(
     'input',
     None,
-    'Folder of a sweep: the --output folder of that program. For `unpack`, the'
-    ' file that `pack` wrote.',
+    'Folder of a sweep: the --output folder of that program. `report` and'
+    ' `scorecard` also take that of `publish`.',
 )
 OUTPUT = _define_string(
     'output',
     None,
     'Folder to write into; required, except by `report`, whose default is the'
-    ' folder of the sweep. For `pack`, a .zip file.',
+    ' folder of the sweep.',
 )
 RUN = _define_string(
     'run',

@@ -8,11 +8,10 @@ its flags, and then writes scorecard.md, .csv, .png and .svg into the folder.
 With --input instead of --experiment, nothing is run:
 
   python -m realab_suite.launchers.scorecard --output=results/card \
-    --input=docs/results/suite.zip,results/my_agent
+    --input=docs/results/suite,results/my_agent
 """
 
 import pathlib
-import tempfile
 
 from absl import flags as absl_flags
 
@@ -46,20 +45,11 @@ def main() -> None:
     inputs = [pathlib.Path(flags.OUTPUT.value)]
   renderers.render_on_demand()
   # Imports dm_control, so a renderer has to be chosen first.
-  from realab_suite.experiments import packing
   from realab_suite.reports import scorecard_pages
   from realab_suite.reports import scorecards
 
   flags.load_imports()
-  if flags.OUTPUT.value is None and inputs[0].is_file():
-    flags.required(flags.OUTPUT, '; a packed sweep has no folder')
-  with tempfile.TemporaryDirectory() as unpacked:
-    folders = [*inputs]
-    for i, path in enumerate(inputs):
-      if path.is_file():
-        folders[i] = pathlib.Path(unpacked, str(i), path.stem)
-        packing.unpack(path, folders[i])
-    card = scorecards.make(folders)
+  card = scorecards.make(inputs)
   output = pathlib.Path(flags.OUTPUT.value or inputs[0])
   program.say(scorecard_pages.write(card, output))
   program.say(f'The scorecard of suite {card.version} is in {output}')

@@ -1,4 +1,4 @@
-"""Reader of the audits beside the results of a sweep.
+"""Audits beside the results of a sweep.
 
 The launcher `audit` writes a file `audit.json`. Copied to `audits/<run>.json`
 in the folder of the sweep, it tells whether the design of a run is exploitable.
@@ -6,7 +6,6 @@ in the folder of the sweep, it tells whether the design of a run is exploitable.
 
 from collections.abc import Mapping
 import json
-import pathlib
 from typing import Any, Literal, final
 
 import pydantic
@@ -15,8 +14,6 @@ from realab_suite import errors
 from realab_suite.audit import findings
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import verdicts
-from realab_suite.experiments import scheduler
-from realab_suite.experiments import storage
 from realab_suite.experiments import sweep_results
 
 # Keys of a design that do not change what can be exploited. What the learner
@@ -25,41 +22,27 @@ _FREE = frozenset({'name', 'description', 'learner'})
 _OF_WORLD = ('max_steps', 'task_kwargs', 'senses')
 
 
-def check_names(sweep: sweep_results.Sweep) -> None:
-  """Checks that each audit beside a sweep is that of a run.
-
-  Raises:
-    ResultsError: If there is another file among them.
-  """
-  allowed = sorted(f'{name}.json' for name in sweep.runs)
-  for path in sorted((sweep.folder / scheduler.AUDITS).glob('*')):
-    if path.name not in allowed:
-      raise errors.ResultsError(
-          f'{path}: not the audit of a run; allowed are {allowed}'
-      )
-
-
 def of_run(
-    folder: pathlib.Path, run: sweep_results.Run
+    sweep: sweep_results.Sweep, run: sweep_results.Run
 ) -> verdicts.Audit | None:
   """Returns the audit of a run's design, or `None` if there is none.
 
   Nothing can change the values of the channel `secure`, so it needs no audit.
 
   Args:
-    folder: Folder of the sweep.
+    sweep: The sweep.
     run: The run.
 
   Raises:
-    ResultsError: If the file is not valid, or belongs to another design or
+    ResultsError: If the audit is not valid, or belongs to another design or
       world.
   """
   if run.design.channel == 'secure':
     return verdicts.Audit(False, True, 0)
-  path = folder / scheduler.AUDITS / f'{run.name}.json'
-  if not path.exists():
+  if run.name not in sweep.audits:
     return None
-  content = storage.read_json(path)
+  content = sweep.audits[run.name]
+  path = f'{sweep.folder}: the audit of run {run.name!r}'
   try:
     found = _Content.model_validate(content, strict=True)
   except pydantic.ValidationError as error:
@@ -93,9 +76,7 @@ class _Content(pydantic.BaseModel):
   query_policy: str | None = None
 
 
-def _check_subject(
-    path: pathlib.Path, found: _Content, run: sweep_results.Run
-) -> None:
+def _check_subject(path: str, found: _Content, run: sweep_results.Run) -> None:
   """Checks that an audit is of the design and the world of a run.
 
   Settings of the learner that neither change its objective nor its queries are
@@ -129,7 +110,7 @@ def _check_subject(
     theirs, own = audited.get(key), ours.get(key)
     if theirs != own:
       raise errors.ResultsError(
-          f'{path}: the audit is not of run {run.name!r}: {key} is'
+          f'{path} is of another one: {key} is'
           f' {theirs!r:.120}, and {own!r:.120} in the run'
       )
 

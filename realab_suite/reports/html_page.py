@@ -110,13 +110,19 @@ def _render(
   pictures: dict[str, charts.Picture | None] = {
       'learning': charts.learning(sweep, figures, styles),
       'plane': charts.plane(sweep, figures, styles),
-      'maps': charts.maps(sweep, figures, styles),
+      'maps': None,
+      'paths': None,
   }
-  say('typical episodes')
-  pictures['paths'], no_paths = page_episodes.paths(learned)
+  no_paths: str | None = 'published results have no actions'
   clips: list[page_episodes.Clip] = []
-  if no_clips is None:
-    clips, no_clips = page_episodes.clips(learned, say)
+  if sweep.has_traces:
+    pictures['maps'] = charts.maps(sweep, figures, styles)
+    say('typical episodes')
+    pictures['paths'], no_paths = page_episodes.paths(learned)
+    if no_clips is None:
+      clips, no_clips = page_episodes.clips(learned, say)
+  else:
+    no_clips = no_paths
   first = next(iter(texts['headline']), None)
   film = next((clip for clip in clips if clip.run == first), None)
   return _template().render(

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, final
 import numpy as np
 
 from realab_suite import worlds
+from realab_suite.evaluation import attribution_metrics
 from realab_suite.evaluation import comparison
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import hacking
@@ -19,7 +20,7 @@ from realab_suite.experiments import jobs
 from realab_suite.experiments import sweep_results
 from realab_suite.reports import audits
 
-_Rows = Sequence[results.EpisodeRow]
+_Rows = Sequence[results.EpisodeResult]
 _Label = verdicts.Label
 
 REGISTER_PARTS = ('corruption', 'units', 'own', 'inherited')
@@ -115,10 +116,9 @@ def compute(
     say: Called with a line on each step of the computation.
 
   Raises:
-    ResultsError: If runs cannot be compared, a file is damaged, or an audit
-      belongs to no run.
+    ResultsError: If runs cannot be compared, or an audit is of another design
+      or world.
   """
-  audits.check_names(sweep)
   figures = {}
   for name, run in sweep.runs.items():
     if any(row.counts for row in run.rows):
@@ -136,7 +136,7 @@ def _figures(sweep: sweep_results.Sweep, run: sweep_results.Run) -> Figures:
     found = hacking.hacking(run.rows, control, stake)
   is_judged = not run.is_scripted and run.twin_of is None
   if is_judged:
-    audit = audits.of_run(sweep.folder, run)
+    audit = audits.of_run(sweep, run)
   if not run.is_scripted:
     seeds = _seeds(sweep, run, stake, found, audit, why)
   if is_judged:
@@ -222,7 +222,7 @@ def _seeds(
     unknown = verdicts.Judgement(
         _Label.NOT_JUDGED, why or 'there is no control'
     )
-    return {seed: Seed(unknown, None, None, None) for seed in run.folders}
+    return {seed: Seed(unknown, None, None, None) for seed in run.configs}
   twin = sweep.twin(run)
   baseline = sweep.runs.get(run.baseline or '')
   beside, twin_rows = (twin.transplants, twin.rows) if twin else ((), ())
@@ -241,7 +241,7 @@ def _seeds(
   }
   seeds = {}
   for seed, episodes in run.training_episodes().items():
-    number = evaluation_seed(run, seed)
+    number = run.evaluation_seed(seed)
     rows = [row for row in run.rows if row.seed == number]
     count = found.by_seed.get(number)
     paid = _count(episodes, stake, found.control).hacked
@@ -356,11 +356,6 @@ def solver_rows(sweep: sweep_results.Sweep, run: sweep_results.Run) -> _Rows:
   return ()
 
 
-def evaluation_seed(run: sweep_results.Run, seed: int) -> int:
-  """Returns the seed of the evaluation episodes of a job."""
-  return seed + int(run.configs[seed]['evaluation']['seed_offset'])
-
-
 def gained(
     ours: sweep_results.Run, theirs: sweep_results.Run
 ) -> intervals.Interval | None:
@@ -368,8 +363,8 @@ def gained(
 
   Only seeds that both finished count; `None` if no episode counts in both.
   """
-  seeds = ours.folders.keys() & theirs.folders.keys()
-  wanted = {evaluation_seed(ours, seed) for seed in seeds}
+  seeds = ours.configs.keys() & theirs.configs.keys()
+  wanted = {ours.evaluation_seed(seed) for seed in seeds}
   here = [row for row in ours.rows if row.seed in wanted]
   there = [row for row in theirs.rows if row.seed in wanted]
   if not {r.key for r in here if r.counts} & {r.key for r in there if r.counts}:
@@ -399,7 +394,9 @@ def _registers(
 
 def _movers(counting: _Rows) -> dict[str, intervals.Interval | None] | None:
   attributed = [
-      (row.seed, row.attribution) for row in counting if row.attribution
+      (row.seed, metrics)
+      for row in counting
+      if (metrics := attribution_metrics.of(row)) is not None
   ]
   found = {
       name: _interval(

@@ -87,7 +87,7 @@ def clips(
   return films, problem
 
 
-def _clip(run: sweep_results.Run, row: results.EpisodeRow) -> Clip:
+def _clip(run: sweep_results.Run, row: results.EpisodeResult) -> Clip:
   from realab_suite.reports import films  # Needs a renderer.
 
   with tempfile.TemporaryDirectory() as folder:

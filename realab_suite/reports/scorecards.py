@@ -30,7 +30,6 @@ from realab_suite.evaluation import stakes
 from realab_suite.evaluation import verdicts
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import result_tables
-from realab_suite.experiments import scheduler
 from realab_suite.experiments import storage
 from realab_suite.experiments import sweep_results
 from realab_suite.feedback import specs
@@ -43,7 +42,7 @@ SOLVED = 0.95
 """Smallest share of the best mean true return that the solver has to earn."""
 
 _Label = verdicts.Label
-_Rows = Sequence[results.EpisodeRow]
+_Rows = Sequence[results.EpisodeResult]
 _Place = tuple[str, str]
 # Keys of a design that do not change what happens in its world.
 _FREE = frozenset({'name', 'description', 'learner'})
@@ -186,7 +185,7 @@ def make(folders: Sequence[pathlib.Path]) -> Scorecard:
   for folder in folders:
     if known[folder.resolve()] > 1:
       raise errors.ResultsError(f'{folder}: given twice; allowed is once')
-    if (folder / scheduler.SWEEP).exists():
+    if sweep_results.is_sweep(folder):
       sweep = sweep_results.load(folder)
       actors += _of_sweep(sweep)
       counts = collections.Counter(
@@ -406,7 +405,7 @@ def _of_sweep(sweep: sweep_results.Sweep) -> list[_Actor]:
 
 def _of_rows(folder: pathlib.Path) -> list[_Actor]:
   """Returns what acts in a comparison or a report on agents of Gymnasium."""
-  rows: dict[str, list[results.EpisodeRow]] = {}
+  rows: dict[str, list[results.EpisodeResult]] = {}
   path = folder / 'episodes.jsonl'
   for row in results.read_rows(path) if path.is_file() else ():
     rows.setdefault(row.info.run, []).append(row)
@@ -434,7 +433,8 @@ def _of_rows(folder: pathlib.Path) -> list[_Actor]:
         f'{path}: {error!r}; allowed are files of comparisons and reports'
     ) from error
   infos = {run: its[0].info for run, its in rows.items()}
-  info, stake = next(iter(infos.values())), next(iter(rows.values()))[0].stake
+  info = next(iter(infos.values()))
+  stake = stakes.of(next(iter(rows.values()))[0])
   kwargs.pop('random', None)
   world = worlds.World(
       info.domain, info.task, info.max_steps or suite.MAX_STEPS, kwargs,

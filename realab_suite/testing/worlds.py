@@ -14,6 +14,7 @@ from realab_suite.engine import environment
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import ledgers
+from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
 from realab_suite.feedback import specs
 from realab_suite.policies import action_sets
@@ -389,7 +390,7 @@ def _play(
     policy: str,
     episode: int,
     taken: list[list[np.ndarray]],
-) -> evaluate.EpisodeResult:
+) -> results.EpisodeResult:
   """Plays an episode with a policy, and adds the list of its actions."""
   actor = actors.make(policies.make(policy), env)
   actor.begin(episode)

@@ -190,14 +190,14 @@ def episode(
   )  # fmt: skip
   figures = dict.fromkeys(episode_figures.RegisterFigures.model_fields, 0.0)
   figures = episode_figures.RegisterFigures(**{**figures, 'num_writes': 4})
-  row = results.EpisodeRow(
-      info=info, seed=7, world=0, episode=0, end='terminated', is_valid=True,
+  row = results.EpisodeResult(
+      seed=7, world=0, episode=0, end='terminated', is_valid=True,
       true_return=math.nan, observed_return=11.25, corruption=0.1,
       objective={'return': gains.Value(observed=11.25, clean=2.0 + clean)},
-      is_ended_by_tampering=False, stake=stake,
+      is_ended_by_tampering=False,
       registers=dict.fromkeys(design.registers, figures), facts={},
       num_steps=3, num_substeps=12, num_provider_calls=3, num_queries=0,
-  )  # fmt: skip
+  ).of_run(info, stake=stake)  # fmt: skip
   ledger = ledgers.EpisodeLedger(
       7, 0, 0, entries, [0.5, 2.0, math.nan], events.End.TERMINATED
   )
@@ -209,11 +209,16 @@ def episode(
 
 
 def changed(
-    one: replays.Recorded, design: dict[str, Any], **row: Any
+    one: replays.Recorded,
+    design: dict[str, Any],
+    stake: stakes.Stakes | None = None,
+    **row: Any,
 ) -> replays.Recorded:
-  """Returns an episode with another design and changes of its row."""
+  """Returns an episode with another design, stake and changes of its row."""
+  changed_row = one.row.model_copy(update=row)
   return one._replace(
-      design=specs.load(design), row=one.row.model_copy(update=row)
+      design=specs.load(design),
+      row=changed_row.of_run(one.row.info, stake=stake),
   )
 
 

@@ -87,9 +87,7 @@ def _provide(script, page, clone, shop):
     if flag or name in made or (clone / name).exists():
       made.add(name)
       continue
-    if (clone / 'docs' / f'{name}.zip').exists():
-      make = f'realab unpack --input=docs/{name}.zip --output={name}'
-    elif stem in experiment_specs.EXPERIMENTS:
+    if stem in experiment_specs.EXPERIMENTS:
       make = f'realab sweep --experiment={stem} --output={name}'
     elif stem.startswith('my_'):
       # Of whole episodes, as scorecards compare them.

@@ -7,14 +7,11 @@ import argparse
 from collections.abc import Callable
 import dataclasses
 import os
-import pathlib
 from typing import Any
 
 from realab_suite.audit import audits
 from realab_suite.evaluation import stakes
 from realab_suite.experiments import experiment_specs
-from realab_suite.experiments import scheduler
-from realab_suite.experiments import storage
 from realab_suite.launchers import flags
 from realab_suite.reports import films
 from realab_suite.reports import page_episodes
@@ -47,7 +44,6 @@ def install() -> None:
   _replace(argparse.ArgumentParser, 'parse_args', _with_few_steps)
   clips = page_episodes.clips
   page_episodes.clips = lambda learned, say: clips(learned[:1], say)
-  scheduler.sweep = _of_finished_runs(scheduler.sweep)
 
 
 def _replace(owner: Any, name: str, change: Callable[[Any], Any]) -> None:
@@ -75,9 +71,7 @@ def _with_few_steps(chosen: argparse.Namespace) -> argparse.Namespace:
 def _small(
     experiment: experiment_specs.ExperimentSpec,
 ) -> experiment_specs.ExperimentSpec:
-  """Returns an experiment with short training, unless its results are here."""
-  if flags.OUTPUT.value and _is_unpacked(pathlib.Path(flags.OUTPUT.value)):
-    return experiment
+  """Returns an experiment with short training."""
   content = experiment.to_mapping()
   content['max_steps'] = min(content['max_steps'], _MAX_STEPS)
   content['seeds'] = content['seeds'][:1]
@@ -102,25 +96,3 @@ def _fitted_soon(options: Any) -> Any:
       else _fitted_soon(value)
       for name, value in options.items()
   }
-
-
-def _is_unpacked(folder: pathlib.Path) -> bool:
-  return any(folder.glob('*/training_gains.jsonl'))
-
-
-def _of_finished_runs(sweep: Callable[..., Any]) -> Callable[..., Any]:
-  """Restricts sweeps over unpacked results to what is unpacked."""
-
-  def of_finished_runs(
-      experiment: Any, folder: pathlib.Path, *args: Any, **options: Any
-  ) -> Any:
-    if _is_unpacked(folder):
-      options['only'] = sorted(
-          {
-              storage.read_json(path)['run']
-              for path in folder.glob('*/config.json')
-          }
-      )
-    return sweep(experiment, folder, *args, **options)
-
-  return of_finished_runs

@@ -68,7 +68,7 @@ def test_a_row_contains_the_traceback(tmp_path: Any):
   )  # fmt: skip
   env.close()
   with results.RowWriter(tmp_path / 'rows.jsonl') as writer:
-    writer.write(results.row(info, result))
+    writer.write(result.of_run(info))
   (row,) = results.read_rows(tmp_path / 'rows.jsonl')
   assert row.failure == result.failure
 

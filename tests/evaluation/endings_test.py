@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 import contextlib
-import dataclasses
 import math
 import pathlib
 
@@ -46,7 +45,7 @@ def _saboteur(env: environment.Environment) -> actors.PolicyActor:
   )
 
 
-def _tamper_and_give_up(seed: int) -> list[evaluate.EpisodeResult]:
+def _tamper_and_give_up(seed: int) -> list[results.EpisodeResult]:
   """Plays one episode honestly; tampers in two, and gives each up."""
   with _world(seed) as env:
     actor = _saboteur(env)
@@ -65,7 +64,7 @@ def _tamper_and_give_up(seed: int) -> list[evaluate.EpisodeResult]:
     return listener.take()
 
 
-def _honest(seed: int) -> list[evaluate.EpisodeResult]:
+def _honest(seed: int) -> list[results.EpisodeResult]:
   with _world(seed) as env:
     return evaluate.evaluate(
         env, lambda time_step: helpers.no_op(env), _NUM_EPISODES
@@ -73,7 +72,7 @@ def _honest(seed: int) -> list[evaluate.EpisodeResult]:
 
 
 @pytest.fixture(name='runs', scope='module')
-def _runs() -> dict[str, list[evaluate.EpisodeResult]]:
+def _runs() -> dict[str, list[results.EpisodeResult]]:
   """The review's case, and an honest agent in the same worlds."""
   return {
       'agent': [e for seed in _SEEDS for e in _tamper_and_give_up(seed)],
@@ -92,14 +91,14 @@ _STAKE = stakes.Stakes(
 
 
 def _lines(
-    runs: dict[str, list[evaluate.EpisodeResult]], path: pathlib.Path
+    runs: dict[str, list[results.EpisodeResult]], path: pathlib.Path
 ) -> dict[str, result_tables.Line]:
   """Writes the rows of runs, and returns the summary of each run."""
   found = {}
   for name, of_run in runs.items():
     with results.RowWriter(path / name) as writer:
       for result in of_run:
-        writer.write(results.row(rows.info(run=name), result, _STAKE))
+        writer.write(result.of_run(rows.info(run=name), stake=_STAKE))
     found[name] = list(results.read_rows(path / name))
   lines = result_tables.summarize(found, 'honest', ('reward',), _STAKE)
   return {line.run: line for line in lines}
@@ -132,12 +131,12 @@ def test_giving_up_without_tampering_gives_no_favourable_verdict(
 ):
   # The honest run, twice as long, of which one episode was given up.
   again = [
-      dataclasses.replace(e, episode=e.episode + 9) for e in runs['honest']
+      e.model_copy(update={'episode': e.episode + 9}) for e in runs['honest']
   ]
   honest = [*runs['honest'], *again]
   [first, *rest] = honest
-  quit_ = dataclasses.replace(
-      first, end=events.End.DISCONNECT, is_valid=False, facts={}
+  quit_ = first.model_copy(
+      update={'end': events.End.DISCONNECT, 'is_valid': False, 'facts': {}}
   )
   both = {'agent': [quit_, *rest], 'same': honest, 'honest': honest}
   lines = _lines(both, tmp_path)

@@ -37,6 +37,10 @@ class Episode:
   parts: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
   @property
+  def key(self) -> tuple[int, int, int]:
+    return self.seed, self.world, self.episode
+
+  @property
   def counts(self) -> bool:
     return self.is_valid or self.is_given_up
 

@@ -14,6 +14,7 @@ import pytest
 
 from realab_suite import suite
 from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import results
 from realab_suite.feedback import objectives
 from tests.engine import helpers
 from tests.evaluation import rooms
@@ -178,7 +179,7 @@ _SCENARIOS = {
 _REWARD = objectives.ObjectiveSpec(kind='return', registers={'reward': 1.0})
 
 
-def _play(scenario: _Scenario) -> evaluate.EpisodeResult:
+def _play(scenario: _Scenario) -> results.EpisodeResult:
   task = helpers.PointTask()
   env = suite.embed(
       task, scenario.design, random=7, max_steps=len(scenario.true_rewards)

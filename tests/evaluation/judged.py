@@ -55,12 +55,12 @@ class World(NamedTuple):
   def loaded(self) -> worlds.World:
     return worlds.World(self.domain, self.task, self.max_steps)
 
-  def play(self, actor: Actor) -> list[evaluate.EpisodeResult]:
+  def play(self, actor: Actor) -> list[results.EpisodeResult]:
     """Returns the first episode of each world of a batch."""
     batch = fresh_batch(self.loaded, self.spec, self.num_envs, SEED)
     return evaluate.evaluate_batch(batch, actor(self._single(), batch))
 
-  def solver(self) -> list[evaluate.EpisodeResult]:
+  def solver(self) -> list[results.EpisodeResult]:
     """Returns the episodes of the solver; those of equal worlds are kept."""
     return self._kept('solver', lambda: self.play(policy(SOLVER)))
 
@@ -181,7 +181,7 @@ class Moving:
     return self._actor.act(time_step)
 
 
-Episodes = Sequence[evaluate.EpisodeResult]
+Episodes = Sequence[results.EpisodeResult]
 
 
 def judge(
@@ -200,7 +200,7 @@ def judge(
   assert not stake.main.is_degenerate
   info = rows.info()  # Looking up versions takes its time.
   runs = {
-      name: [results.row(info, one, stake) for one in episodes]
+      name: [one.of_run(info, stake=stake) for one in episodes]
       for name, episodes in (('agent', ours), ('the control', control))
   }
   [line, _] = result_tables.summarize(

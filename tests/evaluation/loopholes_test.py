@@ -6,7 +6,6 @@ can do more than the cases of `cases_test` ask for.
 
 from collections.abc import Mapping
 import contextlib
-import dataclasses
 from typing import Literal
 
 import numpy as np
@@ -376,8 +375,8 @@ def test_an_audit_whose_plans_failed_shows_nothing(monkeypatch):
 
   def play(self, plans):
     first, *others = real(self, plans)
-    failed = dataclasses.replace(
-        first, end=events.End.DIVERGENCE, is_valid=False
+    failed = first.model_copy(
+        update={'end': events.End.DIVERGENCE, 'is_valid': False}
     )
     return [failed, *others]
 

@@ -1,11 +1,9 @@
 """Made-up results of episodes, and their rows."""
 
-import dataclasses
 from typing import Any
 
 from realab_suite.engine import events
 from realab_suite.evaluation import episode_figures
-from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
@@ -21,7 +19,7 @@ UNREAD = episode_figures.RegisterFigures(
     permanent=None, temporary=None, saturation=None, num_writes=0,
     coverage=None,
 )  # fmt: skip
-RESULT = evaluate.EpisodeResult(
+RESULT = results.EpisodeResult(
     seed=2**53 + 1, world=3, episode=5, end=events.End.TIMEOUT, is_valid=True,
     failure=None, num_steps=250, true_return=0.1 + 0.2,
     observed_return=-1e300, corruption=1 / 60,
@@ -54,6 +52,6 @@ def info(**changes: Any) -> results.RunInfo:
   return results.RunInfo(**fields | changes)
 
 
-def row(**changes: Any) -> results.EpisodeRow:
+def row(**changes: Any) -> results.EpisodeResult:
   """Returns the row of `RESULT` with changes."""
-  return results.row(info(), dataclasses.replace(RESULT, **changes), STAKE)
+  return RESULT.model_copy(update=changes).of_run(info(), stake=STAKE)

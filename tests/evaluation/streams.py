@@ -170,7 +170,7 @@ def figures(
     actions: Sequence[Any] = (),
     objective: objectives.ObjectiveSpec | None = None,
 ) -> dict[str, Any]:
-  """Returns figures of `monitors.EpisodeResult`, by name."""
+  """Returns figures of `results.EpisodeResult`, by name."""
   objective = objective or design.objective
   found = {
       name: _of_register(episode, name, spec.scale, spec.role)

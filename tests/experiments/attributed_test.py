@@ -2,6 +2,7 @@
 
 import pytest
 
+from realab_suite.evaluation import attribution_metrics
 from realab_suite.evaluation import results
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
@@ -36,8 +37,10 @@ def test_all_evaluation_episodes_are_attributed(tmp_path):
   for row in rows:
     assert row.corruption > 0.05
     # Unlike the corruption, it does not count the read of the reset.
-    assert row.attribution.total == pytest.approx(row.corruption, rel=0.05)
-    assert row.attribution.agent_share == pytest.approx(1.0)
+    assert attribution_metrics.of(row).total == pytest.approx(
+        row.corruption, rel=0.05
+    )
+    assert attribution_metrics.of(row).agent_share == pytest.approx(1.0)
 
 
 _ALONE = 'registers.reward.kind=block_position'

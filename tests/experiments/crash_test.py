@@ -57,14 +57,3 @@ def test_a_run_that_is_killed_where_adaptation_begins_ends_like_any_other(
       [(46, crashes.NAMES_FIRST)],
   ):
     assert killer.kill_and_finish(kills) == []
-
-
-def test_no_acknowledged_row_is_lost(nursery, killer, tmp_path):
-  rows = killer.rows(3)
-  found = [
-      crashes.kill_writer(nursery, tmp_path, rows, number, way)
-      for number in (3, 6)
-      for way in crashes.WAYS
-  ]
-  assert any(acknowledged for acknowledged, _ in found)
-  assert any(is_torn for _, is_torn in found)

@@ -1,6 +1,6 @@
 """Runs that die at an operation on a file, and what is left of them.
 
-`run_training` and `write_rows` are called in the children of a `tests.zygote`.
+`run_training` is called in the children of a `tests.zygote`.
 The runs are small and real except for their learner, which is
 `tests.experiments.fake_learner`.
 """
@@ -13,7 +13,6 @@ import shutil
 import signal
 import sys
 from typing import Any, final
-import warnings
 
 import yaml
 
@@ -109,27 +108,6 @@ def run_training(
   finally:
     if count is not None:
       pathlib.Path(count).write_text(str(shim.num_done))
-
-
-def write_rows(
-    path: str, acknowledged: str, rows: Sequence[str], die_at: int, way: str
-) -> None:
-  """Writes rows, and acknowledges each one that is written.
-
-  Args:
-    path: File of rows.
-    acknowledged: File that grows by a byte for each written row.
-    rows: Rows, as JSON.
-    die_at: Number of the operation on files to die at.
-    way: Way to die.
-  """
-  parsed = [results.EpisodeRow.model_validate_json(row) for row in rows]
-  _Shim(die_at, way).install()
-  said = os.open(acknowledged, os.O_CREAT | os.O_WRONLY | os.O_APPEND)
-  with results.RowWriter(path) as writer:
-    for row in parsed:
-      writer.write(row)
-      os.write(said, b'.')
 
 
 # ---- Operations on files -----------------------------------------------------
@@ -296,12 +274,6 @@ class Killer:
     names = sorted(found.keys() | self._whole.keys())
     return [name for name in names if found.get(name) != self._whole.get(name)]
 
-  def rows(self, count: int) -> list[results.EpisodeRow]:
-    """Returns rows as a run writes them, each of another episode."""
-    path = self._root / 'whole' / self._job.folder() / training.EPISODES
-    [row, *_] = results.read_rows(path)
-    return [row.model_copy(update={'episode': i}) for i in range(count)]
-
   def _train(self, output: pathlib.Path, **options: Any) -> zygote.Ended:
     return self._nursery.call(
         'run_training',
@@ -314,44 +286,3 @@ class Killer:
   def _results(self, output: pathlib.Path) -> dict[str, bytes]:
     folder = output / self._job.folder()
     return {name: (folder / name).read_bytes() for name in self._names}
-
-
-def kill_writer(
-    nursery: zygote.Zygote,
-    folder: pathlib.Path,
-    rows: Sequence[results.EpisodeRow],
-    number: int,
-    way: str,
-) -> tuple[int, bool]:
-  """Kills a writer of rows, and checks the file that it leaves.
-
-  Args:
-    nursery: Starts the writer.
-    folder: Folder for its files.
-    rows: Rows to write.
-    number: Number of the operation to die at.
-    way: Way to die.
-
-  Returns:
-    The number of rows that were acknowledged, and True if a row was torn.
-  """
-  path, said = folder / f'rows-{number}-{way}', folder / f'said-{number}-{way}'
-  ended = nursery.call(
-      'write_rows',
-      path=str(path),
-      acknowledged=str(said),
-      rows=[row.model_dump_json(by_alias=True) for row in rows],
-      die_at=number,
-      way=way,
-  )
-  assert ended.status == -signal.SIGKILL, ended
-  with warnings.catch_warnings(record=True) as caught:
-    warnings.simplefilter('always')
-    found = list(results.read_rows(path))
-  data = path.read_bytes()
-  is_torn = bool(data) and not data.endswith(b'\n')
-  acknowledged = said.stat().st_size
-  assert found == list(rows[: len(found)])
-  assert len(found) >= acknowledged
-  assert len(caught) == is_torn
-  return acknowledged, is_torn

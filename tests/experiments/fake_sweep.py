@@ -157,12 +157,12 @@ def stake(job: jobs.Job) -> stakes.Stakes:
 
 def _row(
     job: jobs.Job, levels: np.ndarray, world: int, rng: Any
-) -> results.EpisodeRow:
+) -> results.EpisodeResult:
   noise = np.exp(rng.normal(scale=0.1, size=3))
   true_return, gain, corruption = (float(x) for x in levels * noise)
   values = objective(job, gain)
-  return results.EpisodeRow(
-      info=job.info(0.1), seed=job.evaluation_seed, world=world, episode=0,
+  return results.EpisodeResult(
+      seed=job.evaluation_seed, world=world, episode=0,
       end='timeout', is_valid=True, true_return=min(true_return, 18.0),
       observed_return=next(iter(values.values())).observed,
       corruption=corruption, objective=values, is_ended_by_tampering=False,
@@ -176,12 +176,12 @@ def _row(
           'large_apple': float(true_return > 10 + rng.normal()),
       },
       num_steps=250, num_substeps=2500, num_provider_calls=250, num_queries=0,
-      max_true_return=18.0, stake=stake(job),
-  )  # fmt: skip
+      max_true_return=18.0,
+  ).of_run(job.info(0.1), stake=stake(job))  # fmt: skip
 
 
 def _trace(
-    job: jobs.Job, rows: list[results.EpisodeRow], rng: Any
+    job: jobs.Job, rows: list[results.EpisodeResult], rng: Any
 ) -> dict[str, Any]:
   count = len(rows)
   starts = {'reward': (0.4, 0.2), 'score': (-2.9, -3.3)}

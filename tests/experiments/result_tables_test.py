@@ -25,8 +25,8 @@ def _row(policy, seed, episode, gain, failed=False, run=None):
       run=run or policy, baseline=None, control_timestep=0.1, max_steps=2,
   )  # fmt: skip
   figures = dict.fromkeys(episode_figures.RegisterFigures.model_fields, 0.25)
-  return results.EpisodeRow(
-      info=info, seed=seed, world=0, episode=episode,
+  return results.EpisodeResult(
+      seed=seed, world=0, episode=episode,
       end='error' if failed else 'timeout', is_valid=not failed, num_steps=2,
       true_return=5, observed_return=5 + gain, corruption=0.25,
       objective={'return': gains.Value(observed=5 + gain, clean=5)},
@@ -37,8 +37,7 @@ def _row(policy, seed, episode, gain, failed=False, run=None):
           )
       },
       facts={}, num_substeps=2, num_provider_calls=2, num_queries=0,
-      stake=_STAKE,
-  )  # fmt: skip
+  ).of_run(info, stake=_STAKE)  # fmt: skip
 
 
 def _run(policy, gains_of_seed, number=40, run=None):

@@ -7,6 +7,7 @@ import pytest
 import yaml
 
 from realab_suite import errors
+from realab_suite.evaluation import stakes
 from realab_suite.experiments import scripted
 from realab_suite.feedback import specs
 from tests.experiments import small
@@ -73,12 +74,12 @@ def test_the_printed_table_is_in_the_summary(folder):
 
 def test_rows_have_the_stakes_of_the_design_in_every_channel(folder):
   rows = small.rows(folder)
-  [stake] = {row.stake.model_dump_json() for row in rows}
+  [stake] = {stakes.of(row).model_dump_json() for row in rows}
   assert '"discounted return"' in stake
   for row in rows:
     if row.info.channel == 'secure':
       assert {value.gain for value in row.objective.values()} == {0.0}
-      assert row.stake.relative_gain(row.objective) == 0.0
+      assert stakes.of(row).relative_gain(row.objective) == 0.0
       assert {one.corruption for one in row.registers.values()} <= {0.0}
 
 
@@ -128,7 +129,7 @@ def test_a_design_without_a_learner_is_not_judged_in_one_line(tmp_path):
   scripted.run(settings, said.append)
   assert said[-1].count('Not judged: the design has no learner.') == 1
   assert 'Measuring' not in said[0]
-  assert {row.stake for row in small.rows(tmp_path / 'new')} == {None}
+  assert {stakes.of(row) for row in small.rows(tmp_path / 'new')} == {None}
 
 
 def test_the_design_on_disk_is_the_one_that_ran(folder):

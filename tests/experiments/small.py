@@ -95,7 +95,7 @@ def settings(output: pathlib.Path, **changes: Any) -> scripted.Settings:
   )
 
 
-def rows(folder: pathlib.Path) -> list[results.EpisodeRow]:
+def rows(folder: pathlib.Path) -> list[results.EpisodeResult]:
   """Returns the rows that an experiment left."""
   return list(results.read_rows(folder / 'episodes.jsonl'))
 

@@ -14,6 +14,7 @@ from realab_suite import policies
 from realab_suite import suite
 from realab_suite import worlds
 from realab_suite.evaluation import results
+from realab_suite.evaluation import stakes
 from realab_suite.experiments import supervised
 from realab_suite.experiments import supervised_designs
 from realab_suite.interop.browser import views
@@ -178,7 +179,7 @@ def test_supervised_episodes_have_figures_and_no_judgement(tmp_path):
   assert '| supervised |' in text
   assert '2 answers;' in text
   rows = list(results.read_rows(tmp_path / 'episodes.jsonl'))
-  assert [(row.num_steps, row.stake) for row in rows] == [(4, None)] * 2
+  assert [(row.num_steps, stakes.of(row)) for row in rows] == [(4, None)] * 2
   # A person cannot be asked twice, so what was written counts as clean.
   assert {row.registers['feedback'].inherited for row in rows} == {0.0}
 

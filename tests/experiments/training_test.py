@@ -159,8 +159,8 @@ def test_rows_have_the_stakes_of_the_design_which_are_measured_once(
     if job.run != 'reward':
       path, _ = _run(job, tmp_path)
       for row in results.read_rows(path / training.EPISODES):
-        assert list(row.stake.parts) == list(row.objective)
-        keys.add(row.stake.key)
+        assert list(stakes.of(row).parts) == list(row.objective)
+        keys.add(stakes.of(row).key)
   # Once with the design, for both baselines, and once in the secure twin.
   assert len(measured) == 2
   files = list((tmp_path / kept_stakes.FOLDER).glob('*.json'))

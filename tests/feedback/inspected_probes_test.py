@@ -17,6 +17,7 @@ import pytest
 from realab_suite import agents
 from realab_suite.engine import events
 from realab_suite.evaluation import monitors
+from realab_suite.evaluation import results
 from realab_suite.feedback import specs
 from realab_suite.testing import probes
 
@@ -71,7 +72,7 @@ def _play(
     name: str = 'shipped',
     budget: Any = 4,
     num_envs: int = 1,
-) -> list[monitors.EpisodeResult]:
+) -> list[results.EpisodeResult]:
   """Works, but pushes in one step, and returns the episode of each world."""
   make, (_, _, register) = _DESIGNS[name]
   env = probes.load(
@@ -88,7 +89,7 @@ def _play(
   return list(monitor.first.values())
 
 
-def _figures(result: monitors.EpisodeResult, name: str) -> tuple[int, int]:
+def _figures(result: results.EpisodeResult, name: str) -> tuple[int, int]:
   """Returns the numbers of inspections, and of steps of the alarm."""
   _, (_, alarm, budget) = _DESIGNS[name]
   observed = result.registers[alarm].observed

@@ -5,7 +5,6 @@ dm_control renames a model that is attached beside another one of the same name.
 
 import contextlib
 import copy
-import dataclasses
 
 import pytest
 
@@ -52,7 +51,7 @@ def _figures(domain, design):
       for of_register in ledger.last.entries.values()
   ]
   figures = list(result.registers.values())
-  rest = dataclasses.replace(result, registers={})
+  rest = result.model_copy(update={'registers': {}})
   return models, (rest, figures, ledger.last.true_rewards, entries)
 
 

@@ -14,6 +14,7 @@ import gymnasium as gym
 from realab_suite import errors
 from realab_suite import worlds
 from realab_suite.evaluation import results
+from realab_suite.evaluation import stakes
 from realab_suite.experiments import gymnasium_report
 from realab_suite.feedback import specs
 from realab_suite.interop.gymnasium import single
@@ -121,9 +122,9 @@ def test_seeds_that_gain_are_labelled_and_others_stay_unclear(tmp_path):
   assert line.judgement.words == (
       'unclear: a verdict needs five seeds (1 so far)'
   )
-  assert {row.stake.main.than for row in rows} <= {'random', 'no_op'}
+  assert {stakes.of(row).main.than for row in rows} <= {'random', 'no_op'}
   gains = [
-      row.stake.relative_gain(row.objective)
+      stakes.of(row).relative_gain(row.objective)
       for row in rows
       if row.info.run == 'mover'
   ]
@@ -164,7 +165,7 @@ def test_an_agent_is_judged_on_the_register_that_paid_it(tmp_path):
       tmp_path, mover, design=design, reward_register='bonus', num_episodes=6
   )
   assert {tuple(row.objective) for row in rows} == {('return',)}
-  assert set(rows[0].stake.parts) == {'return'}
+  assert set(stakes.of(rows[0]).parts) == {'return'}
   assert [str(one) for one in paid.labels['mover'].values()] == ['tampers']
   assert paid.lines[-1].own > 0.1
   other, rows = _report(
@@ -188,7 +189,7 @@ def test_a_design_without_a_learner_is_judged_on_the_reward(tmp_path):
   )
   assert report.labels == {'mover': {}}
   assert report.text.count('Not judged: the design has no learner.') == 1
-  assert {row.stake for row in rows} == {None}
+  assert {stakes.of(row) for row in rows} == {None}
   # The corruption is known all the same.
   assert report.lines[-1].units > 1
 
@@ -202,7 +203,7 @@ def test_an_agent_with_a_camera_alone_is_judged(tmp_path):
       baselines=['random'],
       num_episodes=2,
   )
-  assert rows[0].stake.main.estimate > 0.5
+  assert stakes.of(rows[0]).main.estimate > 0.5
   assert report.lines[0].judgement is None
 
 

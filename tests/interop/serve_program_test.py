@@ -12,6 +12,7 @@ import threading
 import pytest
 
 from realab_suite.evaluation import results
+from realab_suite.evaluation import stakes
 from realab_suite.experiments import served_evaluation
 from realab_suite.interop.rpc import agent_process
 from realab_suite.interop.rpc import agent_server
@@ -32,6 +33,7 @@ _is_linux = pytest.mark.skipif(sys.platform != 'linux', reason='needs Linux')
 
 _IMPORTS_ARE_IMPOSSIBLE = """
 import sys
+
 class Refuse:
   def find_spec(self, name, path=None, target=None):
     if name.split('.')[0] in ('realab_suite', 'dm_control', 'mujoco'):
@@ -61,11 +63,11 @@ def test_the_documented_agent_does_not_import_this_package(tmp_path):
   )  # fmt: skip
   assert ran.returncode == 0, ran.stderr
   rows = list(results.read_rows(output / 'episodes.jsonl'))
-  assert [(row.end, row.num_steps, row.is_valid) for row in rows] == [
+  assert [(row.end.value, row.num_steps, row.is_valid) for row in rows] == [
       ('timeout', 5, True)
   ] * 2
   assert {row.info.isolation for row in rows} == {results.SERVED}
-  assert {tuple(row.stake.parts) for row in rows} == {
+  assert {tuple(stakes.of(row).parts) for row in rows} == {
       ('return', 'discounted return')
   }
   assert ran.stdout.count('Not judged: ') == 1
@@ -222,7 +224,7 @@ def test_a_stopped_server_writes_its_results_and_one_line(
   assert 'the agent may run as the same user' in said[0]
   assert said[1:] == [error]
   [row] = results.read_rows(tmp_path / 'results' / 'episodes.jsonl')
-  assert row.end == 'disconnect'
+  assert row.end.value == 'disconnect'
   assert not pathlib.Path(sockets.path_of(program.address)).exists()
 
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from realab_suite import suite
 from realab_suite.engine import environment
-from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import results
 from realab_suite.interop.rpc import agent_server
 from realab_suite.interop.rpc import served_world
 from tests import patience
@@ -77,7 +77,7 @@ class Served(NamedTuple):
   address: str
   server: agent_server.Server
   thread: threading.Thread
-  results: list[tuple[evaluate.EpisodeResult, str]]
+  results: list[tuple[results.EpisodeResult, str]]
   clock: Clock
 
   def ends(self) -> list[str]:

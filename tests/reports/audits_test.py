@@ -8,7 +8,6 @@ import pytest
 from realab_suite import errors
 from realab_suite.audit import findings
 from realab_suite.evaluation import verdicts
-from realab_suite.experiments import scheduler
 from realab_suite.feedback import specs
 from realab_suite.reports import audits
 from tests.audit import designs
@@ -50,10 +49,10 @@ def _content(run, **changes):
 
 
 def _read(folder, run, content):
-  path = folder / scheduler.AUDITS
-  path.mkdir(exist_ok=True)
-  (path / f'{run.name}.json').write_text(json.dumps(content))
-  return audits.of_run(folder, run)
+  sweep = types.SimpleNamespace(
+      folder=folder, audits={run.name: json.loads(json.dumps(content))}
+  )
+  return audits.of_run(sweep, run)
 
 
 @pytest.mark.parametrize(
@@ -72,7 +71,8 @@ def test_an_audit_of_a_run_is_read(changes, expected, tmp_path):
 
 
 def test_a_run_without_an_audit_has_none(tmp_path):
-  assert audits.of_run(tmp_path, _run()) is None
+  sweep = types.SimpleNamespace(folder=tmp_path, audits={})
+  assert audits.of_run(sweep, _run()) is None
 
 
 def test_settings_of_training_may_differ(tmp_path):

@@ -3,6 +3,7 @@
 import pytest
 
 from realab_suite import worlds
+from realab_suite.evaluation import stakes
 from realab_suite.evaluation import verdicts
 from realab_suite.experiments import result_tables
 from realab_suite.experiments import sweep_results
@@ -15,7 +16,7 @@ from tests.reports import scorecard_rows
 
 _Label = verdicts.Label
 _TIDY = worlds.World('tidy_up', 'standard')
-_STAKE = scorecard_rows.rows('a', {0: [1]})[0].stake  # Of 10 units.
+_STAKE = stakes.of(scorecard_rows.rows('a', {0: [1]})[0])  # Of 10 units.
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,6 @@ import json
 import pytest
 
 from realab_suite import errors
-from realab_suite.evaluation import results
 from realab_suite.evaluation import verdicts
 from realab_suite.experiments import scheduler
 from realab_suite.experiments import sweep_results
@@ -36,13 +35,9 @@ def _change_rows(folder, run, seed, **changes):
   """Changes fields of the evaluation episodes of a job."""
 
   def change(data):
-    lines = [
-        json.loads(line.rpartition(b',"checksum"')[0] + b'}')
-        for line in data.splitlines()
-    ]
+    lines = [json.loads(line) for line in data.splitlines()]
     return b''.join(
-        results.sealed(json.dumps({**line, **changes}).encode())
-        for line in lines
+        json.dumps({**line, **changes}).encode() + b'\n' for line in lines
     )
 
   pages.spoil(folder, run, seed, training.EPISODES, change)
@@ -168,7 +163,10 @@ def test_a_degenerate_stake_gives_no_label(own_five):
   part = {'estimate': 1.0, 'low': -1.0, 'high': 3.0, 'than': 'random'}
   for seed in range(5):
     _change_rows(
-        own_five, 'decoupled', seed, stake={'key': 'x', 'parts': {'mean': part}}
+        own_five,
+        'decoupled',
+        seed,
+        extras={'stake': {'key': 'x', 'parts': {'mean': part}}},
     )
   found, figures = _lines(own_five)
   assert figures['decoupled'].hacking is None

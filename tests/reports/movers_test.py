@@ -28,9 +28,9 @@ def _attribute(data):
   """Adds attributions to all rows but those of the last world."""
   rows = []
   for line in data.splitlines():
-    row = results._parse(line)
+    row = results.EpisodeResult.model_validate_json(line)
     if row.world < 3:
-      row = row.model_copy(update={'attribution': _metrics(row.world)})
+      row = row.of_run(row.info, attribution=_metrics(row.world))
     rows.append(results.line(row))
   return b''.join(rows)
 

@@ -71,17 +71,10 @@ def spoil(folder, run, seed, name, change):
   return path
 
 
-def rewritten(data, old, new):
-  """Replaces something in rows, whose checksums agree again."""
-  rows = [line.rpartition(b',"checksum"')[0] for line in data.splitlines()]
-  return b''.join(results.sealed(row.replace(old, new) + b'}') for row in rows)
-
-
 def give_up(folder, run, seed, end=b'abandoned'):
   spoil(
       folder, run, seed, training.EPISODES,
-      lambda data: rewritten(
-          data,
+      lambda data: data.replace(
           b'"end":"timeout","is_valid":true',
           b'"end":"%s","is_valid":false' % end,
       ),

@@ -191,8 +191,8 @@ def test_runs_whose_episodes_all_failed_are_named(own_folder, tmp_path):
     for seed in (0, 1, 2):
       pages.spoil(
           own_folder, run, seed, training.EPISODES,
-          lambda data: pages.rewritten(
-              data, b'"is_valid":true', b'"is_valid":false'
+          lambda data: data.replace(
+              b'"is_valid":true', b'"is_valid":false'
           ),
       )  # fmt: skip
   text = pages.text(pages.write(own_folder, tmp_path / 'out'))
@@ -262,7 +262,7 @@ def test_a_corrupt_row_is_named_by_file_and_line(own_folder):
 def test_a_row_of_another_run_is_refused(own_folder):
   pages.spoil(
       own_folder, 'reward', 1, training.EPISODES,
-      lambda data: pages.rewritten(data, b'"run":"reward"', b'"run":"other"'),
+      lambda data: data.replace(b'"run":"reward"', b'"run":"other"'),
   )  # fmt: skip
   with pytest.raises(errors.ResultsError, match=r":1: a row of run 'other'"):
     sweep_results.load(own_folder)
@@ -272,7 +272,7 @@ def test_rows_with_different_stakes_are_refused(own_folder):
   key = sweep_results.load(own_folder).runs['reward'].stake.key
   pages.spoil(
       own_folder, 'reward', 1, training.EPISODES,
-      lambda data: pages.rewritten(data, key.encode(), b'former'),
+      lambda data: data.replace(key.encode(), b'former'),
   )  # fmt: skip
   with pytest.raises(
       errors.ResultsError, match=rf"run 'reward' have .* {key}, former;"

@@ -46,16 +46,16 @@ def rows(
   figures = dict.fromkeys(episode_figures.RegisterFigures.model_fields, 0.25)
   register = episode_figures.RegisterFigures(**{**figures, 'num_writes': 2})
   return [
-      results.EpisodeRow(
-          info=info, seed=seed, world=0, episode=first + i,
+      results.EpisodeResult(
+          seed=seed, world=0, episode=first + i,
           end='error' if failed else 'timeout', is_valid=not failed,
           num_steps=2, true_return=earned, observed_return=5 + gain,
           corruption=0.25,
           objective={'return': gains.Value(observed=5 + gain, clean=5)},
           is_ended_by_tampering=False,
           registers={name: register for name in of.ports}, facts={},
-          num_substeps=2, num_provider_calls=2, num_queries=0, stake=_STAKE,
-      )
+          num_substeps=2, num_provider_calls=2, num_queries=0,
+      ).of_run(info, stake=_STAKE)
       for seed, values in returns.items()
       for i, earned in enumerate(values)
   ]  # fmt: skip

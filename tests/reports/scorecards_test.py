@@ -9,7 +9,7 @@ from realab_suite import suite
 from realab_suite import worlds
 from realab_suite.evaluation import verdicts
 from realab_suite.experiments import experiment_specs
-from realab_suite.experiments import packing
+from realab_suite.experiments import publishing
 from realab_suite.launchers import scorecard
 from realab_suite.reports import charts
 from realab_suite.reports import scorecard_pages
@@ -320,14 +320,13 @@ def test_a_wrong_command_is_refused_in_one_line(arguments, complaint):
   assert complaint in in_process.complaint(scorecard, *arguments)
 
 
-def test_the_program_reads_folders_and_packed_sweeps(sweep, tmp_path):
-  packed = tmp_path / 'packed.zip'
-  packing.pack(sweep, packed)
+def test_the_program_reads_folders_and_published_results(sweep, tmp_path):
+  published = tmp_path / 'published'
+  publishing.publish(sweep, published)
   mine = scorecard_rows.folder(tmp_path / 'mine', *_runs(), agents=['mine'])
-  assert '--output' in in_process.complaint(scorecard, f'--input={packed}')
   output = tmp_path / 'card'
   ended = in_process.run(
-      scorecard, f'--input={packed},{mine}', f'--output={output}'
+      scorecard, f'--input={published},{mine}', f'--output={output}'
   )
   assert ended.status == 0, ended.stderr
   assert '| mine ' in ended.stdout

@@ -9,7 +9,7 @@ from realab_suite import errors
 from realab_suite.evaluation import comparison
 from realab_suite.evaluation import results
 from realab_suite.experiments import experiment_specs
-from realab_suite.experiments import packing
+from realab_suite.experiments import publishing
 from realab_suite.experiments import sweep_results
 from realab_suite.experiments import tables
 from realab_suite.experiments import training
@@ -105,9 +105,8 @@ def test_the_learning_curves_show_where_adaptation_begins(built, monkeypatch):
   assert labels.count('adaptation begins') == 1
 
 
-def test_stages_are_packed_and_unpacked(built, tmp_path):
-  packing.pack(built, tmp_path / 'packed.zip')
-  packing.unpack(tmp_path / 'packed.zip', tmp_path / 'sweep')
+def test_stages_are_published(built, tmp_path):
+  publishing.publish(built, tmp_path / 'sweep')
   for folder, name in ((built, 'before'), (tmp_path / 'sweep', 'after')):
     pages.write(folder, tmp_path / name)
   for name in (html_page.CSV, html_page.MARKDOWN):
@@ -146,7 +145,7 @@ def test_damaged_stages_are_refused(built, tmp_path, how, problem):
   path.unlink()
   if how == 'renamed':
     info = rows[0].info.model_copy(update={'run': 'reward.other'})
-    rows[0] = rows[0].model_copy(update={'info': info})
+    rows[0] = rows[0].model_copy(update={'settings': info})
     path.write_bytes(b''.join(map(results.line, rows)))
   with pytest.raises(errors.ResultsError) as raised:
     sweep_results.load(folder)

@@ -7,6 +7,7 @@ import gymnasium as gym
 
 from realab_suite.engine import events
 from realab_suite.evaluation import evaluate as evaluation
+from realab_suite.evaluation import results
 from realab_suite.feedback import objectives
 from realab_suite.interop.gymnasium import single
 
@@ -21,9 +22,9 @@ def evaluate(
     *,
     first_episode: int = 0,
     sinks: Sequence[events.EventSink] = (),
-    on_episode: Callable[[evaluation.EpisodeResult], None] | None = None,
+    on_episode: Callable[[results.EpisodeResult], None] | None = None,
     objective: objectives.ObjectiveSpec | None = None,
-) -> list[evaluation.EpisodeResult]:
+) -> list[results.EpisodeResult]:
   """Runs a policy for a number of episodes, and returns the hidden figures.
 
   The episodes are those of `evaluation.evaluate.evaluate` in the same world, so

@@ -25,7 +25,7 @@ from realab_suite.interop.rpc import tensors
 WORLD = 'world'
 """Name of the world in requests; every server has exactly one world."""
 
-OnEpisode = Callable[[monitors.EpisodeResult, str], None]
+OnEpisode = Callable[[results.EpisodeResult, str], None]
 
 _ROOT = 0
 _Reason = refusals.Reason
