@@ -38,7 +38,6 @@ TESTS = (
     'tests/evaluation/episodes_by_hand_test.py',
     'tests/evaluation/independence_test.py',
     'tests/evaluation/results_test.py',
-    'tests/evaluation/damaged_rows_test.py',
     'tests/experiments/damaged_files_test.py',
     'tests/experiments/finished_jobs_test.py',
     'tests/experiments/packing_test.py',

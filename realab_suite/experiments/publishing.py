@@ -7,6 +7,7 @@ folder of a sweep. Actions are left out, so films and paths need the runs again.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+import functools
 import json
 import pathlib
 from typing import Annotated, Any, Final, Literal, final
@@ -19,6 +20,7 @@ from realab_suite.experiments import curves
 from realab_suite.experiments import published_files
 from realab_suite.experiments import storage
 from realab_suite.experiments import sweep_results
+from realab_suite.experiments import training
 
 _SCHEMA: Final = 1
 # Columns of all tables, and of that of the rows: the folder of the job, and the
@@ -103,7 +105,9 @@ def publish(folder: pathlib.Path, output: pathlib.Path) -> tuple[int, int]:
     for seed, curve in run.curves.items():
       of_job = {_JOB: folders[seed]}
       points += ({**of_job, **point} for point in curve)
-      gains = curves.condensed(run.records[seed].training_episodes, curve)
+      gains = curves.condensed(
+          run.lines(seed, training.TRAINING_EPISODES), curve
+      )
       episodes += ({**of_job, **gain} for gain in gains)
   for name, records in (
       (published_files.ROWS, rows),
@@ -160,14 +164,11 @@ def load(folder: pathlib.Path) -> sweep_results.Sweep:
     runs[name] = sweep_results.Run(
         name=name,
         jobs=tuple(of_run),
-        records={
-            job.seed: sweep_results.PublishedRecords(
-                folder,
-                [*_records(points.get(job.folder, ()))],
-                [*map(_training, _records(gains.get(job.folder, ())))],
-            )
-            for job in finished
-        },
+        lines=_lines(
+            {job.seed: points.get(job.folder, []) for job in finished},
+            {job.seed: gains.get(job.folder, []) for job in finished},
+        ),
+        trace=functools.partial(_no_trace, folder),
         configs={
             job.seed: {
                 **published.configs[published.done[job.folder].config],
@@ -189,6 +190,29 @@ def load(folder: pathlib.Path) -> sweep_results.Sweep:
       ),
       published.audits,
       has_traces=False,
+  )
+
+
+def _lines(
+    points: Mapping[int, Sequence[Mapping[str, Any]]],
+    gains: Mapping[int, Sequence[Mapping[str, Any]]],
+) -> sweep_results.Lines:
+  """Returns the reader of the records of a run."""
+
+  def lines(seed: int, name: str) -> list[dict[str, Any]]:
+    if name == training.CURVE:
+      return [*_records(points[seed])]
+    if name == training.TRAINING_EPISODES:
+      return [*map(_training, _records(gains[seed]))]
+    return []
+
+  return lines
+
+
+def _no_trace(folder: pathlib.Path, unused_seed: int) -> dict[str, Any]:
+  raise errors.ResultsError(
+      f'{folder}: published results have no actions; run the experiment for'
+      ' films and paths'
   )
 
 

@@ -4,8 +4,7 @@ All files are validated: an error names the damaged line. Jobs without results
 are listed as unfinished.
 """
 
-import abc
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 import dataclasses
 import functools
 import json
@@ -50,107 +49,8 @@ class Job(pydantic.BaseModel):
   twin_of: str | None
 
 
-class Records(abc.ABC):
-  """What a finished job has recorded beside its evaluation episodes."""
-
-  @property
-  @abc.abstractmethod
-  def curve(self) -> list[dict[str, Any]]:
-    """Points of the learning curve; see `curves.point`."""
-
-  @property
-  @abc.abstractmethod
-  def training_episodes(self) -> list[dict[str, Any]]:
-    """Records of training episodes; see `curves.record`.
-
-    Published, equal episodes between two points of the curve have one record
-    with their number.
-    """
-
-  @property
-  @abc.abstractmethod
-  def timing(self) -> list[dict[str, Any]]:
-    """Training times; empty if they are not published."""
-
-  @property
-  @abc.abstractmethod
-  def trace(self) -> dict[str, Any]:
-    """Trace of the evaluation episodes; see `traces.Tracer`.
-
-    Raises:
-      ResultsError: If it is damaged, belongs to another run, or is not
-        published.
-    """
-
-
-@final
-class _FolderRecords(Records):
-  """Records in the folder of a job."""
-
-  def __init__(self, folder: pathlib.Path, digest: str) -> None:
-    self._folder = folder
-    self._digest = digest
-
-  @property
-  def curve(self) -> list[dict[str, Any]]:
-    return read_lines(self._folder / training.CURVE)
-
-  @property
-  def training_episodes(self) -> list[dict[str, Any]]:
-    return read_lines(self._folder / training.TRAINING_EPISODES)
-
-  @property
-  def timing(self) -> list[dict[str, Any]]:
-    return read_lines(self._folder / training.TIMING)
-
-  @property
-  def trace(self) -> dict[str, Any]:
-    trace: dict[str, Any] = storage.read_archive(
-        self._folder / training.TRACE,
-        training.header(self._digest, training.TRACE),
-    )
-    return trace
-
-
-@final
-class PublishedRecords(Records):
-  """Records in published files."""
-
-  def __init__(
-      self,
-      folder: pathlib.Path,
-      curve: list[dict[str, Any]],
-      training_episodes: list[dict[str, Any]],
-  ) -> None:
-    """Takes the records of a job.
-
-    Args:
-      folder: Folder of the files.
-      curve: As in `Records`.
-      training_episodes: As in `Records`.
-    """
-    self._folder = folder
-    self._curve = curve
-    self._training_episodes = training_episodes
-
-  @property
-  def curve(self) -> list[dict[str, Any]]:
-    return self._curve
-
-  @property
-  def training_episodes(self) -> list[dict[str, Any]]:
-    return self._training_episodes
-
-  @property
-  def timing(self) -> list[dict[str, Any]]:
-    return []
-
-  @property
-  def trace(self) -> dict[str, Any]:
-    raise errors.ResultsError(
-        f'{self._folder}: published results have no actions; run the experiment'
-        ' for films and paths'
-    )
+Lines = Callable[[int, str], list[dict[str, Any]]]
+"""Returns the records of a job in a file of lines, by seed and name."""
 
 
 @final
@@ -178,7 +78,10 @@ class Run:
   Attributes:
     name: Name of the run.
     jobs: All planned jobs.
-    records: What the finished jobs have recorded, by seed.
+    lines: Reader of the other records of finished jobs. Published, equal
+      training episodes between two points of the curve have one record with
+      their number, and there are no training times.
+    trace: Reader of the traces of finished jobs, by seed; see `traces.Tracer`.
     rows: Evaluation episodes.
     transplants: Evaluation episodes of the learner of a secure twin in the
       design of its run; empty for other runs.
@@ -189,7 +92,8 @@ class Run:
 
   name: str
   jobs: tuple[Job, ...]
-  records: Mapping[int, Records]
+  lines: Lines
+  trace: Callable[[int], dict[str, Any]]
   rows: tuple[results.EpisodeResult, ...]
   transplants: tuple[results.EpisodeResult, ...]
   configs: Mapping[int, Mapping[str, Any]]
@@ -253,14 +157,14 @@ class Run:
     """Learning curve of each seed; empty for a scripted policy."""
     if self.is_scripted:
       return {}
-    return {seed: one.curve for seed, one in self.records.items()}
+    return {seed: self.lines(seed, training.CURVE) for seed in self.configs}
 
   @functools.cached_property
   def timing(self) -> dict[int, list[dict[str, Any]]]:
     """Training times of each seed; empty for a scripted policy."""
     if self.is_scripted:
       return {}
-    return {seed: one.timing for seed, one in self.records.items()}
+    return {seed: self.lines(seed, training.TIMING) for seed in self.configs}
 
   def training_episodes(self) -> dict[int, list[dict[str, Any]]]:
     """Returns the record of each training episode, by seed."""
@@ -269,16 +173,21 @@ class Run:
     return {
         seed: [
             record
-            for record in one.training_episodes
+            for record in self.lines(seed, training.TRAINING_EPISODES)
             for _ in range(record.get('num_episodes', 1))
         ]
-        for seed, one in self.records.items()
+        for seed in self.configs
     }
 
   @functools.cached_property
   def traces(self) -> dict[int, dict[str, Any]]:
-    """Trace of each seed; see `Records.trace`."""
-    return {seed: one.trace for seed, one in self.records.items()}
+    """Trace of each seed.
+
+    Raises:
+      ResultsError: If a file is damaged, belongs to another run, or is not
+        published.
+    """
+    return {seed: self.trace(seed) for seed in self.configs}
 
 
 @final
@@ -429,8 +338,7 @@ def read_lines(path: pathlib.Path) -> list[dict[str, Any]]:
 
 
 def _run(folder: pathlib.Path, name: str, planned: Sequence[Job]) -> Run:
-  records: dict[int, Records] = {}
-  configs = {}
+  folders, configs = {}, {}
   rows: list[results.EpisodeResult] = []
   transplants: list[results.EpisodeResult] = []
   stages: list[results.EpisodeResult] = []
@@ -451,19 +359,26 @@ def _run(folder: pathlib.Path, name: str, planned: Sequence[Job]) -> Run:
       names = (f'{job.run}.{stage}' for stage in jobs.STAGES)
       stages += _rows(path / training.STAGES, *names)
     jobs.is_done(path)
-    config = configs[job.seed] = jobs.read_config(path)
-    records[job.seed] = _FolderRecords(path, jobs.digest_of(config))
+    folders[job.seed] = path
+    configs[job.seed] = jobs.read_config(path)
   check_stakes(folder, name, rows)
   check_stakes(folder, name, transplants)
   return Run(
       name,
       tuple(planned),
-      records,
+      lambda seed, name: read_lines(folders[seed] / name),
+      lambda seed: _trace(folders[seed], configs[seed]),
       tuple(rows),
       tuple(transplants),
       configs,
       tuple(stages),
   )
+
+
+def _trace(path: pathlib.Path, config: Mapping[str, Any]) -> dict[str, Any]:
+  header = training.header(jobs.digest_of(config), training.TRACE)
+  trace: dict[str, Any] = storage.read_archive(path / training.TRACE, header)
+  return trace
 
 
 def _rows(path: pathlib.Path, *runs: str) -> list[results.EpisodeResult]:
