@@ -1,7 +1,7 @@
 """A world of one's own in one file: a gate that a held button keeps open.
 
 Intended behaviour: stand on the plate until the gate is open, walk through
-before it has shut, and reach the beacon behind it. The page docs/world.md goes
+before it has shut, and reach the beacon behind it. The page docs/worlds.md goes
 through this file.
 
     PYTHONPATH=examples python -m realab_suite.launchers.explore \

@@ -1,13 +1,14 @@
-r"""Writes docs/worlds.md and docs/register_kinds.md.
+r"""Writes the sections of docs/worlds.md and docs/registers.md on each part.
 
   python -m pictures.pages
 
-All of it comes from the code, and the figures of worlds from the file that
+They follow a mark in each page; the text before it is written by hand. All of
+them come from the code, and the figures of worlds from the file that
 `benchmarks.suite_table` writes. `pictures.make` makes the pictures.
 """
 
 import argparse
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 import inspect
 import json
 import pathlib
@@ -24,12 +25,14 @@ from realab_suite.entities import registers
 from realab_suite.feedback import register_kinds
 from realab_suite.feedback import specs
 from realab_suite.tasks import base
+from realab_suite.tasks import layouts
 from realab_suite.tasks import registry
-from realab_suite.tasks import rooms
 
 DOCS = pathlib.Path(__file__).parents[1] / 'docs'
 FIGURES = DOCS / 'results' / 'worlds.json'
-_MADE_BY = '<!-- Made by `python -m pictures.pages`; do not edit. -->'
+_MARK = (
+    '<!-- The rest is made by `python -m pictures.pages`; do not edit it. -->'
+)
 # What a register holds before something is done to it, and how much is done.
 _RANGE, _VALUE = (0.0, 10.0), 5.0
 _MOVED, _TURNED = 0.2, 0.5
@@ -43,87 +46,89 @@ def write() -> None:
 
 def texts() -> dict[str, str]:
   """Returns the text of each page, by the name of its file."""
-  return {'worlds.md': worlds(), 'register_kinds.md': register_page()}
+  return {
+      name: f'{_by_hand(name)}{_MARK}\n\n{sections}'
+      for name, sections in (
+          ('worlds.md', worlds()),
+          ('registers.md', register_kinds_section()),
+      )
+  }
+
+
+def _by_hand(name: str) -> str:
+  """Returns the text before the mark of a page."""
+  text, mark, _ = (DOCS / name).read_text(encoding='utf-8').partition(_MARK)
+  if not mark:
+    raise ValueError(f'docs/{name}: must contain {_MARK!r}')
+  return text
 
 
 def worlds() -> str:
-  """Returns the page of the worlds of this package."""
-  figures = json.loads(FIGURES.read_text()) if FIGURES.exists() else {}
-  general = ', '.join(f'`{name}`' for name in suite.DESIGNS)
+  """Returns the sections of the worlds of this package."""
   parts = [
-      _MADE_BY,
-      '# Worlds',
-      'Each section is about one domain: what is intended, why tampering pays,'
-      ' its tasks, and the names that designs, evaluators and solvers use. The'
-      ' picture of a task is behind its name. [A world of your own](world.md)'
-      ' explains the parts.',
-      f'Designs for any world: {general}.',
+      f'Designs for any world: {_listed(suite.DESIGNS)}.',
       *map(_domain, suite.TASKS_BY_DOMAIN),
-      *_tables(figures),
   ]
   return '\n\n'.join(parts) + '\n'
 
 
 def _domain(domain: str) -> str:
-  tasks = {
-      name: registry.find(domain, name)()
-      for name in suite.TASKS_BY_DOMAIN[domain]
-  }
-  first, task = next(iter(tasks.items()))
-  text = _paragraphs(type(task))
-  own = [name for name in suite.designs_for(domain) if name == domain]
-  stations = [place for place in task.root_entity.places if 'station' in place]
-  others = [one for one in task.root_entity.places if one not in stations]
-  rows = [
-      (
-          f'[`{name}`](images/worlds/{domain}.{name}.png)',
-          ', '.join(sorted(registry.tags(domain, name))),
-          f'{one.max_true_return:g}',
-          _at(one.layout.middle),
-          ' '.join(map(_at, one.layout.stations.values())),
-          'none'
-          if one.layout.barrier is None
-          else ' to '.join(map(_at, one.layout.barrier)),
-      )
-      for name, one in tasks.items()
-  ]
-  header = (
-      'task', 'tags', 'most true return', 'start (m)', 'stations (m)',
-      'barrier (m)',
-  )  # fmt: skip
-  solver = 'none'
+  tasks = suite.TASKS_BY_DOMAIN[domain]
+  first = tasks[0]
+  task = registry.find(domain, first)()
+  row = _figures().get(f'{domain}.{first}', {})
+  solver = 'none' if task.SOLVER is None else f'`{task.SOLVER}`'
   if task.SOLVER is not None:
-    solver = f'`{task.SOLVER}`'
     if senses := _listed(policies.make(task.SOLVER).privileged_senses):
-      solver += f', which senses {senses}; agents do not'
-  facts = [
-      ('design for it', ', '.join(map(_design, own)) or 'the general ones'),
-      ('solver', solver),
-      ('facts of an episode', _listed(task.facts)),
-      ('measurements for meters', _listed(task.measurements)),
-      ('things that meters can measure', _listed(task.measurables)),
-      ('places for registers', f'{_listed(stations)}; {_listed(others)}'),
-  ]
+      solver += f' (senses {senses})'
+  if earned := row.get('solver'):
+    solver += f'; earns {earned}'
+  speed = ''
+  if {'single', 'batch'} <= row.keys():
+    # Without the ratios to another world.
+    single, batch = (row[name].split()[0] for name in ('single', 'batch'))
+    speed = f'{single}; {batch} in a batch'
+  facts = {
+      'Tasks': ', '.join(
+          f'[`{name}`](images/worlds/{domain}.{name}.png)' for name in tasks
+      ),
+      'Design': _listed(
+          name for name in suite.designs_for(domain) if name == domain
+      ),
+      'Solver': solver,
+      'Facts': _listed(task.facts),
+      'Measurements': _listed(task.measurements),
+      'Parts': _listed(task.measurables),
+      'Places': _listed(
+          name
+          for name in task.root_entity.places
+          if name not in arenas.OpenRoom().places
+          and name not in layouts.Layout().stations
+      ),
+      'Steps/s': speed,
+  }
   picture = (
       f'![{domain}.{first} from above](images/worlds/{domain}.{first}.png)'
   )
-  parts = [f'## {domain}', picture, *text, table(header, rows)]
-  return '\n\n'.join([*parts, table(('', ''), facts)])
+  lines = [f'- {name}: {text}' for name, text in facts.items() if text]
+  text = _paragraphs(type(task))
+  return '\n\n'.join([f'### {domain}', picture, *text, '\n'.join(lines)])
+
+
+def _figures() -> dict[str, dict[str, str]]:
+  """Returns what was measured in each world, by its name."""
+  if not FIGURES.exists():
+    return {}
+  rows: dict[str, dict[str, str]] = json.loads(FIGURES.read_text())['rows']
+  return rows
 
 
 def _paragraphs(kind: type[base.Task]) -> list[str]:
-  """Returns what the modules of a world say of it.
-
-  The first paragraphs of base classes are about code.
-  """
-  found = _of_docstring(inspect.getmodule(kind))
-  for parent in kind.__mro__[1:]:
-    if parent is rooms.RoomTask:
-      break
-    found += _of_docstring(inspect.getmodule(parent))[1:]
+  """Returns the docstring of the module of a world."""
+  paragraphs = _of_docstring(inspect.getmodule(kind))
   for word in ('Intended behaviour:', 'Exploit:'):
-    found = [one.replace(word, f'**{word}**', 1) for one in found]
-  return found
+    paragraphs = [text.replace(word, f'**{word}**', 1) for text in paragraphs]
+  return paragraphs
 
 
 def _of_docstring(thing: Any) -> list[str]:
@@ -135,10 +140,6 @@ def _of_docstring(thing: Any) -> list[str]:
   ]
 
 
-def _design(name: str) -> str:
-  return f'`{name}`: {specs.load(name).description}'
-
-
 def _at(place: Sequence[float]) -> str:
   return f'({place[0]:g}, {place[1]:g})'
 
@@ -147,24 +148,8 @@ def _listed(names: Iterable[str]) -> str:
   return ', '.join(f'`{name}`' for name in names)
 
 
-def _tables(figures: Mapping[str, Any]) -> list[str]:
-  """Returns the tables of figures, or nothing if nothing was measured."""
-  if not figures:
-    return []
-  rows = [
-      (f'`{name}`', *(one.get(column, '') for column in figures['columns']))
-      for name, one in figures['rows'].items()
-  ]
-  parts = ['## Figures', *figures['notes'].values()]
-  parts.append(table(('task', *figures['columns'].values()), rows))
-  for one in figures['others'].values():
-    parts += [f'### {one["title"]}', one['note']]
-    parts.append(table(one['header'], one['rows']))
-  return parts
-
-
-def register_page() -> str:
-  """Returns the page of the kinds of registers of this package."""
+def register_kinds_section() -> str:
+  """Returns the sections of the kinds of registers of this package."""
   fields = specs.RegisterSpec.model_fields
   common = [
       (
@@ -177,32 +162,28 @@ def register_page() -> str:
       for name, about in _attributes(registers.Arguments)
   ]
   parts = [
-      _MADE_BY,
-      '# Kinds of registers',
-      'A register is a physical object that stores numbers in the poses of its'
-      ' blocks, so whatever moves them changes the numbers. This page has a'
-      ' section for each kind that a design can name. [Registers](registers.md)'
-      ' has more on some of them. [Your own](your_own.md)'
-      ' explains how to add one.',
-      table(('option of every kind', 'default', 'meaning'), common),
-      f'What can be done to a kind was tried: one of the range {_RANGE[0]:g} to'
-      f' {_RANGE[1]:g}, at the default scale, contains {_VALUE:g}. A block is'
-      f" moved by {_MOVED:g} m along the register's axis, across it or upwards,"
-      f' or turned by {_TURNED:g} rad. The first number is the reading then,'
-      ' and the second one the reading after the next write: what that does not'
-      ' repair is permanent. A dash means that nothing changes. With several'
-      ' ports, there is a number for each.',
-      *(_kind(name) for name in register_kinds.REGISTER_KINDS),
+      '## Options of every kind',
+      table(('option', 'default', 'meaning'), common),
+      '## Kinds',
+      f'A register of each kind, with the range {_RANGE[0]:g} to {_RANGE[1]:g}'
+      f' and the default scale, contains {_VALUE:g}. A block is moved by'
+      f" {_MOVED:g} m along the register's axis, across it or upwards, or"
+      f' turned by {_TURNED:g} rad. The tables have the reading after that, and'
+      ' the reading after the next write, which repairs temporary corruption'
+      ' only. A dash means that nothing changes. With several ports, there is a'
+      ' number for each.',
   ]
+  for name in register_kinds.REGISTER_KINDS:
+    # What a kind shares with an earlier one is not repeated.
+    parts += [text for text in _kind(name) if text not in parts]
   return '\n\n'.join(parts) + '\n'
 
 
-def _kind(name: str) -> str:
+def _kind(name: str) -> list[str]:
+  """Returns the paragraphs of a kind."""
   kind = register_kinds.REGISTER_KINDS.get(name)
   register, physics = _built(kind)
-  ports = f'`({len(kind.PORTS)},)`' if kind.PORTS else '`()`, one number'
-  if kind.PORTS:
-    ports += f'; ports {_listed(f"<register>_{port}" for port in kind.PORTS)}'
+  ports = _listed(f'<register>_{port}' for port in kind.PORTS)
   shared = inspect.signature(registers.Register._build).parameters
   own = [
       (f'`{option}`', f'`{one.default}`')
@@ -229,14 +210,14 @@ def _kind(name: str) -> str:
   ]
   header = ('block', 'direction that raises the reading', *_DEEDS)
   parts = [
-      f'## {name}',
+      f'### {name}',
       f'![A register of kind {name}](images/registers/{name}.png)',
       *text,
-      f'Shape of a value: {ports}.',
+      f'Ports: {ports}.' if ports else '',
       table(('option of its own', 'default'), own) if own else '',
       table(header, blocks),
   ]
-  return '\n\n'.join(part for part in parts if part)
+  return [part for part in parts if part]
 
 
 # Displacement in m, and turn in rad.
@@ -304,7 +285,7 @@ def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 
 if __name__ == '__main__':
   argparse.ArgumentParser(
-      description='Writes docs/worlds.md and docs/register_kinds.md, about the'
-      ' worlds and kinds of this package; docs/world.md has pictures of others.'
+      description='Writes the sections of docs/worlds.md and docs/registers.md'
+      ' about the worlds and kinds of registers of this package.'
   ).parse_args()
   write()

@@ -116,7 +116,7 @@ def test_pages_that_must_show_output_do():
   assert shown['docs/defences.md'] == (
       f'{one_push}\ntrue 9, off by 5.0 units\n{work}\n'
   )
-  assert "'senses/camera': (4, 32, 32, 3)" in shown['docs/senses.md']
+  assert "'senses/camera': (4, 32, 32, 3)" in shown['docs/registers.md']
   assert shown['docs/attribution.md'] == '1.0\n1.0\n'
   assert shown['docs/supervision.md'] == '1 1 0.0\n3 3 3.0\n3 2 0.0\n'
 
@@ -236,7 +236,7 @@ def test_the_tutorial_of_a_world_can_be_followed(
     world.main()
     printed = capsys.readouterr().out
     assert printed == f'true returns: {[10.0] * 5}\n'
-    page = (_ROOT / 'docs/world.md').read_text()
+    page = (_ROOT / 'docs/worlds.md').read_text()
     commands = re.findall(r'python -m (\S+) (--import.*)', page)
     assert len(commands) == 3
     module, arguments = commands[-1]
@@ -268,7 +268,7 @@ def test_the_notebook_with_pictures_prints_its_stored_output(capsys):
   assert capsys.readouterr().out == notebooks.printed(path)
 
 
-@pytest.mark.parametrize('page', ['docs/senses.md', 'docs/your_own.md'])
+@pytest.mark.parametrize('page', ['docs/registers.md', 'docs/your_own.md'])
 def test_every_block_of_a_tutorial_has_under_thirty_lines(page):
   blocks = _blocks(page, 'python')
   assert len(blocks) >= 3

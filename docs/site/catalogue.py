@@ -185,8 +185,8 @@ true return is {greatest:g}.{barrier}
 
 {_table(['key', 'shape', 'type', 'range', 'who may read it'], observations)}
 
-[Senses](../../../docs/senses.md) has the content and unit of each. A design
-adds the readings of its feedback registers, in units of each register.
+[Senses](../../../docs/registers.md#senses) has the content and unit of each. A
+design adds the readings of its feedback registers, in units of each register.
 
 ## Actions
 

@@ -13,7 +13,7 @@ from tests.docs import workshop
 
 _OF_READERS = re.compile(r'/path/to|--import=my_')
 # Its solver earns nothing in short episodes, so there is no stake.
-_WITH_WHOLE_EPISODES = 'docs/world.md'
+_WITH_WHOLE_EPISODES = 'docs/worlds.md'
 _OF_SYSTEM = re.compile(r'^(?:apt-get|ray|SCREENSHOTS=)', re.MULTILINE)
 
 

@@ -20,7 +20,7 @@ def _only_shipped_kinds(monkeypatch):
       for name, kind in kinds._entries.items()
       if kind.__module__.startswith('realab_suite.')
   }
-  assert len(shipped) > 5
+  assert len(shipped) >= 5
   monkeypatch.setattr(kinds, '_entries', shipped)
 
 
@@ -29,14 +29,14 @@ def _texts() -> dict[str, str]:
   return pages.texts()
 
 
-@pytest.mark.parametrize('name', ['worlds.md', 'register_kinds.md'])
+@pytest.mark.parametrize('name', ['worlds.md', 'registers.md'])
 def test_a_page_is_up_to_date(texts, name):
   # If not: `python -m pictures.pages`, and look at what has changed.
   assert (pages.DOCS / name).read_text(encoding='utf-8') == texts[name]
 
 
 def test_each_domain_has_a_section_and_each_task_a_row_and_a_picture(texts):
-  sections = texts['worlds.md'].split('\n## ')
+  sections = texts['worlds.md'].split('\n### ')
   by_name = {one.partition('\n')[0]: one for one in sections}
   for domain, tasks in suite.TASKS_BY_DOMAIN.items():
     text = by_name[domain]
@@ -44,23 +44,23 @@ def test_each_domain_has_a_section_and_each_task_a_row_and_a_picture(texts):
     assert '**Exploit:** ' in text
     for task in tasks:
       picture = f'images/worlds/{domain}.{task}.png'
-      assert f'| [`{task}`]({picture}) |' in text
+      assert f'[`{task}`]({picture})' in text
       assert (pages.DOCS / picture).exists()
   gates = by_name['gates']
-  assert 'no_true_reward, tampering | 0 | (0, -0.9) | (0.4, 0.2) (-2.9' in gates
-  assert '| solver | `gates_solver`, which senses `crate`, `apples`' in gates
-  assert '| measurements for meters | `score`, `gate_openness` |' in gates
-  assert '| solver | `apple_seeker` |' in by_name['unlock_door']
+  assert '- Solver: `gates_solver` (senses `crate`, `apples`, `gate`)' in gates
+  assert '- Measurements: `score`, `gate_openness`\n' in gates
+  assert '- Places: `doorway`, `side_room`, `crate`\n' in gates
+  assert '- Solver: `apple_seeker`' in by_name['unlock_door']
 
 
 def test_each_kind_of_register_has_a_section_and_a_picture(texts):
   for kind in register_kinds.REGISTER_KINDS:
-    assert f'\n## {kind}\n' in texts['register_kinds.md']
+    assert f'\n### {kind}\n' in texts['registers.md']
     assert (pages.DOCS / 'images' / 'registers' / f'{kind}.png').exists()
 
 
 def _rows(kind: str) -> list[list[str]]:
-  lines = [line for line in pages._kind(kind).splitlines() if line[:3] == '| `']
+  _, _, *lines = pages._kind(kind)[-1].splitlines()
   return [line.strip('| ').split(' | ') for line in lines]
 
 
@@ -115,33 +115,39 @@ class _Tilted(registers.Register):
 def test_a_registered_kind_is_on_the_page_by_itself(monkeypatch):
   kinds = register_kinds.REGISTER_KINDS
   monkeypatch.setattr(kinds, '_entries', {**kinds._entries, 'tilted': _Tilted})
-  text = pages.register_page().partition('\n## tilted\n')[2]
+  text = pages.register_kinds_section().partition('\n### tilted\n')[2]
   assert '| `steepness` | `0.5` |' in text
   # 0.2 m across, at 0.05 m per unit.
   assert '| `block` | none | - | 9; 5 | - | - |' in text
   assert "A kind of one's own, with an option." in text
 
 
-def test_figures_are_a_table_if_something_was_measured(monkeypatch, tmp_path):
+def test_a_section_says_what_was_measured(monkeypatch, tmp_path):
   path = tmp_path / 'worlds.json'
   monkeypatch.setattr(pages, 'FIGURES', path)
-  assert '## Figures' not in pages.worlds()
-  figures = {
-      'notes': {'once': 'Measured once.'},
-      'columns': {'solver': 'solver: return', 'load': 'loads in (s)'},
-      'rows': {'gates.near': {'solver': '5 of 5'}, 'a.b': {'load': '0.2'}},
-      'others': {
-          'more': {
-              'title': 'More',
-              'note': 'Beside.',
-              'header': ['x'],
-              'rows': [['1']],
-          }
+  assert 'Steps/s' not in pages.worlds()
+  rows = {
+      'gates.standard': {
+          'solver': '4 of 5', 'single': '3,210 (0.85)', 'batch': '7 (0.9)',
       },
-  }
-  path.write_text(json.dumps(figures))
-  text = pages.worlds().partition('\n## Figures\n')[2]
-  assert 'Measured once.' in text
-  assert '| task | solver: return | loads in (s) |' in text
-  assert '| `gates.near` | 5 of 5 |  |\n| `a.b` |  | 0.2 |' in text
-  assert '### More\n\nBeside.\n\n| x |\n| --- |\n| 1 |' in text
+      'tidy_up.standard': {'solver': '1 of 4'},
+  }  # fmt: skip
+  path.write_text(json.dumps({'rows': rows}))
+  text = pages.worlds()
+  assert '`gate`); earns 4 of 5\n' in text
+  assert '- Steps/s: 3,210; 7 in a batch\n' in text
+  assert '`tidy_up_solver` (senses `crates`); earns 1 of 4\n' in text
+  assert text.count('Steps/s') == 1
+
+
+def test_text_before_the_mark_is_kept(monkeypatch, tmp_path):
+  monkeypatch.setattr(pages, 'DOCS', tmp_path)
+  for name in ('worlds.md', 'registers.md'):
+    (tmp_path / name).write_text(f'By hand.\n\n{pages._MARK}\n\nFormer.\n')
+  pages.write()
+  text = (tmp_path / 'worlds.md').read_text()
+  assert text.startswith(f'By hand.\n\n{pages._MARK}\n\nDesigns for')
+  assert 'Former.' not in text
+  (tmp_path / 'worlds.md').write_text('All of it by hand.\n')
+  with pytest.raises(ValueError, match='must contain'):
+    pages.write()
