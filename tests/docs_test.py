@@ -349,7 +349,16 @@ def test_attributes_of_modules_in_pages_exist():
   tasks = {f'{domain}.{task}' for domain, task in suite.ALL_TASKS}
   checked = 0
   for page, (module, name) in _mentions(r'`(?:\w+\.)*([a-z_]+)\.(\w+)[(`]'):
-    is_file = name in ('csv', 'html', 'json', 'jsonl', 'md', 'png', 'py')
+    is_file = name in (
+        'csv',
+        'html',
+        'json',
+        'jsonl',
+        'md',
+        'parquet',
+        'png',
+        'py',
+    )
     if module in sources and not is_file and f'{module}.{name}' not in tasks:
       checked += 1
       assert re.search(
