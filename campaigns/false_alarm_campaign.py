@@ -24,6 +24,7 @@ import numpy as np
 
 from campaigns import figure_lines
 from campaigns import foreign_worlds
+from realab_suite import judging
 from realab_suite import policies
 from realab_suite import worlds
 from realab_suite.evaluation import batch_actors
@@ -208,7 +209,7 @@ def _control(
     world: worlds.World, design: specs.DesignSpec, episodes: int
 ) -> tuple[stakes.Stakes, hacking.Control]:
   """Returns the stakes of a design, and the solver as control."""
-  stake = worlds.stakes_of(world, design)
+  stake = judging.stakes_of(world, design)
   solver, random = (
       _play(world, design, policies.make(name), episodes, seed=0)
       for name in (world.solver or '', stakes.RANDOM)

@@ -31,6 +31,7 @@ _BELOW_SUITE = (
     'evaluation',
 )  # fmt: skip
 _WITH_SUITE = (*_BELOW_SUITE, 'suite')
+_WITH_WORLDS = (*_WITH_SUITE, 'worlds', 'judging')
 _MAY_IMPORT = {
     # Functions that are imported when they are asked for.
     '__init__': _WITH_SUITE,
@@ -69,14 +70,15 @@ _MAY_IMPORT = {
     ),
     'suite': _BELOW_SUITE,
     'worlds': _WITH_SUITE,
+    'judging': (*_WITH_SUITE, 'worlds'),
     'testing': _WITH_SUITE,
-    'audit': (*_WITH_SUITE, 'worlds'),
+    'audit': _WITH_WORLDS,
     'interop': _WITH_SUITE,
-    'experiments': (*_WITH_SUITE, 'worlds', 'audit', 'agents', 'interop'),
-    'reports': (*_WITH_SUITE, 'worlds', 'audit', 'agents', 'experiments'),
-    'datasets': (*_WITH_SUITE, 'worlds', 'audit', 'experiments'),
+    'experiments': (*_WITH_WORLDS, 'audit', 'agents', 'interop'),
+    'reports': (*_WITH_WORLDS, 'audit', 'agents', 'experiments'),
+    'datasets': (*_WITH_WORLDS, 'audit', 'experiments'),
     'launchers': (
-        *_WITH_SUITE, 'worlds', 'audit', 'agents', 'interop', 'experiments',
+        *_WITH_WORLDS, 'audit', 'agents', 'interop', 'experiments',
         'reports', 'datasets',
     ),
 }  # fmt: skip

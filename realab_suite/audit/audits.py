@@ -13,6 +13,7 @@ from typing import final
 import numpy as np
 
 from realab_suite import errors
+from realab_suite import judging
 from realab_suite import policies
 from realab_suite import worlds
 from realab_suite.audit import aiming
@@ -87,7 +88,7 @@ class Auditor:
     if design.objective is None or world.solver is None:
       raise errors.SpecError(
           f'design {design.name!r}: no audit, because there is no measure of'
-          f' gains: {worlds.why_no_stakes(world, design)}'
+          f' gains: {judging.why_no_stakes(world, design)}'
       )
     self._settings = settings
     self._solver = world.solver
@@ -123,7 +124,7 @@ class Auditor:
     """
     settings = self._settings
     self._tell('stakes')
-    stake = worlds.stakes_of(settings.world, settings.design)
+    stake = judging.stakes_of(settings.world, settings.design)
     if stake is None or len(stake.degenerate) == len(stake.parts):
       raise errors.SpecError(
           f'design {settings.design.name!r}: no audit, because there is no'
@@ -224,7 +225,7 @@ class Auditor:
     )
 
   def _result(self, found: findings.Comparison) -> findings.Audit:
-    obstacles = worlds.obstacles_of(
+    obstacles = judging.obstacles_of(
         self._settings.world, self._settings.design, found.stake
     )
     if failed := self._num_failed + self._num_failed_in_search:

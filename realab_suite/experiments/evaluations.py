@@ -11,6 +11,7 @@ from typing import Any, final
 
 import yaml
 
+from realab_suite import judging
 from realab_suite import suite
 from realab_suite import worlds
 from realab_suite.engine import environment
@@ -84,7 +85,8 @@ class Evaluation:
     self._folder = folder
     self._say = say
     self._control = control
-    self._why_not_judged = worlds.why_no_stakes(world, design) or why_no_control
+    why = judging.why_no_stakes(world, design)
+    self._why_not_judged = why or why_no_control
     self._stake: stakes.Stakes | None = None
     self.rows: dict[str, list[results.EpisodeResult]] = {}
     self._writer = None
@@ -100,9 +102,9 @@ class Evaluation:
 
   def measure(self) -> None:
     """Measures the stakes of the design, which later rows contain."""
-    if worlds.key_of_stakes(self._world, self._design) is not None:
+    if judging.key_of_stakes(self._world, self._design) is not None:
       self._say('Measuring the stakes of the design')
-    self._stake = worlds.stakes_of(self._world, self._design)
+    self._stake = judging.stakes_of(self._world, self._design)
 
   def describe(
       self, designs: Mapping[str, specs.DesignSpec], **facts: Any
@@ -173,8 +175,8 @@ class Evaluation:
     world, design, stake = self._world, self._design, self._stake
     obstacles, solver = [], None
     if self._control is not None:
-      obstacles = worlds.obstacles_of(world, design, stake)
-      solver = world.solver if worlds.coincides(world, design) else None
+      obstacles = judging.obstacles_of(world, design, stake)
+      solver = world.solver if judging.coincides(world, design) else None
     lines = result_tables.summarize(
         self.rows,
         self._control,

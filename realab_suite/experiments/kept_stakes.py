@@ -5,6 +5,7 @@ import fcntl
 import pathlib
 from typing import Final
 
+from realab_suite import judging
 from realab_suite import worlds
 from realab_suite.config import validation
 from realab_suite.evaluation import stakes
@@ -26,13 +27,13 @@ def stakes_of(
     folder: Folder of the experiment.
 
   Returns:
-    The stakes, or `None`; see `worlds.stakes_of`.
+    The stakes, or `None`; see `judging.stakes_of`.
 
   Raises:
     ResultsError: If a file is not JSON or cannot be read or written.
     SpecError: If it is damaged otherwise.
   """
-  key = worlds.key_of_stakes(world, design)
+  key = judging.key_of_stakes(world, design)
   if key is None:
     return None
   path = folder / FOLDER / f'{key}.json'
@@ -58,7 +59,7 @@ def _measured(
     world: worlds.World, design: specs.DesignSpec, path: pathlib.Path
 ) -> stakes.Stakes | None:
   """Measures stakes, and writes them into a file."""
-  found = worlds.stakes_of(world, design)
+  found = judging.stakes_of(world, design)
   if found is not None:
     storage.write_json(path, found.model_dump())
   return found

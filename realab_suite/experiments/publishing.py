@@ -125,7 +125,6 @@ def publish(folder: pathlib.Path, output: pathlib.Path) -> tuple[int, int]:
       'machines': machines,
       'audits': sweep.audits,
   }
-  # Without white space, which would be a third of it.
   text = json.dumps(content, separators=(',', ':')) + '\n'
   storage.write_whole(output / sweep_results.CONTENTS, text.encode())
   return len(done), len(sweep.unfinished)

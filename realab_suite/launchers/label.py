@@ -16,6 +16,7 @@ from typing import Any
 from absl import flags as absl_flags
 
 from realab_suite import errors
+from realab_suite import judging
 from realab_suite.launchers import flags
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
@@ -77,7 +78,6 @@ def _scripted(seeds: tuple[int, ...]) -> list[Any]:
     SpecError: If a design, a policy or a task does not exist.
   """
   from realab_suite import policies
-  from realab_suite import worlds
   from realab_suite.datasets import sources
   from realab_suite.feedback import specs
 
@@ -97,9 +97,9 @@ def _scripted(seeds: tuple[int, ...]) -> list[Any]:
   for design, of_design in zip(designs, twins, strict=True):
     stake = None
     if names:
-      why_not = worlds.why_no_stakes(world, design)
+      why_not = judging.why_no_stakes(world, design)
       program.say(f'{design.name}: {why_not or "measuring its stakes"}')
-      stake = worlds.stakes_of(world, design)
+      stake = judging.stakes_of(world, design)
     for twin in of_design:
       for policy in names:
         program.say(f'{policy} acts in {twin.name} ({twin.channel})')

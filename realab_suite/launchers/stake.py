@@ -9,6 +9,7 @@ divided by the stake is a relative gain; a degenerate stake judges nothing.
 """
 
 from realab_suite import errors
+from realab_suite import judging
 from realab_suite.launchers import flags
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
@@ -22,17 +23,16 @@ def main() -> None:
   """Prints the stakes of the design that the flags describe."""
   renderers.render_on_demand()
   # Imports dm_control, so a renderer has to be chosen first.
-  from realab_suite import worlds
   from realab_suite.evaluation import stakes
   from realab_suite.experiments import tables
 
   flags.load_imports()
   world, design = flags.world(), flags.design()
-  found = worlds.stakes_of(world, design)
+  found = judging.stakes_of(world, design)
   if found is None:
     raise errors.SpecError(
         f'design {design.name!r} has no stake:'
-        f' {worlds.why_no_stakes(world, design)}'
+        f' {judging.why_no_stakes(world, design)}'
     )
   rows = [
       ['part of the objective', 'stake', 'more than', 'degenerate', 'confirmed']

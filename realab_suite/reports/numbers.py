@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, final
 
 import numpy as np
 
-from realab_suite import worlds
+from realab_suite import judging
 from realab_suite.evaluation import attribution_metrics
 from realab_suite.evaluation import comparison
 from realab_suite.evaluation import gains
@@ -230,8 +230,8 @@ def _seeds(
     beside = twin_rows = baseline.rows
   obstacles, coincidence = [], None
   if run.twin_of is None:
-    obstacles = worlds.obstacles_of(run.world, run.design, stake)
-    if worlds.coincides(run.world, run.design):
+    obstacles = judging.obstacles_of(run.world, run.design, stake)
+    if judging.coincides(run.world, run.design):
       coincidence = verdicts.coincidence(
           run.rows, solver_rows(sweep, run), stake
       )

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, final
 import numpy as np
 
 from realab_suite import errors
+from realab_suite import judging
 from realab_suite import policies
 from realab_suite import suite
 from realab_suite import worlds
@@ -469,10 +470,10 @@ def _of_rows(folder: pathlib.Path) -> list[_Actor]:
       control,
       gains.consumed(design),
       stake,
-      worlds.why_no_stakes(world, design),
+      judging.why_no_stakes(world, design),
       agents,
       ['favourable labels need the report of a sweep'],
-      world.solver if worlds.coincides(world, design) else None,
+      world.solver if judging.coincides(world, design) else None,
   )
   actors = []
   for line in lines:

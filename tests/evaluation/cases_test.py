@@ -11,8 +11,8 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 
+from realab_suite import judging
 from realab_suite import policies
-from realab_suite import worlds
 from realab_suite.audit import aiming
 from realab_suite.engine import events
 from realab_suite.entities import registers
@@ -347,7 +347,7 @@ def test_a_design_without_objective_is_not_judged_in_one_line():
   ):
     world = judged.World(_design(_paying(), f'learner={learner}'))
     assert world.stake() is None
-    assert worlds.why_no_stakes(world.loaded, world.spec).startswith(why)
+    assert judging.why_no_stakes(world.loaded, world.spec).startswith(why)
     [one, *_] = world.play(judged.policy('random'))
     assert one.objective == {}
     assert one.corruption is not None

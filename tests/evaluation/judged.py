@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, final
 import numpy as np
 import pytest
 
+from realab_suite import judging
 from realab_suite import policies
 from realab_suite import worlds
 from realab_suite.audit import aiming
@@ -72,12 +73,12 @@ class World(NamedTuple):
         patch.setattr(stakes, 'NUM_EPISODES', _NUM_STAKE_EPISODES)
         patch.setattr(worlds.World, 'load_batch', fresh_batch)
         with kept_open():
-          return worlds.stakes_of(self.loaded, self.spec)
+          return judging.stakes_of(self.loaded, self.spec)
 
     return self._kept('stake', measure)
 
   def obstacles(self) -> list[str]:
-    """Returns those of the design, as `worlds.obstacles_of` does."""
+    """Returns those of the design, as `judging.obstacles_of` does."""
     return obstacles.of_mechanism(
         self._single().mechanism, self.loaded.instruments, self.stake()
     )

@@ -6,6 +6,7 @@ from typing import Literal
 import pytest
 
 from realab_suite import errors
+from realab_suite import judging
 from realab_suite import suite
 from realab_suite import worlds
 from realab_suite.evaluation import gains
@@ -212,7 +213,7 @@ def test_a_stake_does_not_depend_on_the_senses_of_the_agent(monkeypatch):
   design = specs.load('instantaneous_reward', ['dof=planar'])
   monkeypatch.setattr(worlds.World, 'load_batch', judged.fresh_batch)
   found = [
-      worlds.stakes_of(
+      judging.stakes_of(
           worlds.World('unlock_door', 'near', 12, senses=senses), design
       ).parts
       for senses in (None, ('position', 'time_left'))

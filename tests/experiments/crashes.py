@@ -16,7 +16,7 @@ from typing import Any, final
 
 import yaml
 
-from realab_suite import worlds
+from realab_suite import judging
 from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
 from realab_suite.experiments import experiment_specs
@@ -98,7 +98,7 @@ def run_training(
         path.stem: stakes.Stakes.model_validate_json(path.read_bytes())
         for path in pathlib.Path(measured).rglob('stakes/*.json')
     }
-    worlds.stakes_of = lambda *what: known[worlds.key_of_stakes(*what)]
+    judging.stakes_of = lambda *what: known[judging.key_of_stakes(*what)]
   shim = _Shim(die_at, way)
   shim.install()
   sys.argv = ['train', f'--experiment={experiment}', f'--run={_RUN}',

@@ -4,8 +4,8 @@ from unittest import mock
 
 import pytest
 
+from realab_suite import judging
 from realab_suite import suite
-from realab_suite import worlds
 from realab_suite.evaluation import results
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
@@ -43,7 +43,7 @@ _EXPERIMENT = {
 @pytest.fixture(autouse=True)
 def _without_stakes():
   """Keeps the worlds in which stakes are measured out of these tests."""
-  with mock.patch.object(worlds, 'stakes_of', return_value=None):
+  with mock.patch.object(judging, 'stakes_of', return_value=None):
     yield
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from realab_suite import errors
-from realab_suite import worlds
+from realab_suite import judging
 from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
 from realab_suite.experiments import experiment_specs
@@ -172,7 +172,7 @@ def test_a_job_waits_for_stakes_that_another_one_measures(
     tmp_path, monkeypatch
 ):
   job = _job()
-  found = worlds.stakes_of(job.experiment.world, job.design)
+  found = judging.stakes_of(job.experiment.world, job.design)
   path = tmp_path / kept_stakes.FOLDER / f'{found.key}.json'
 
   def wait(file, operation):
@@ -180,7 +180,7 @@ def test_a_job_waits_for_stakes_that_another_one_measures(
     assert operation == fcntl.LOCK_EX
     storage.write_json(path, found.model_dump())
 
-  monkeypatch.setattr(worlds, 'key_of_stakes', lambda *unused: found.key)
+  monkeypatch.setattr(judging, 'key_of_stakes', lambda *unused: found.key)
   monkeypatch.setattr(kept_stakes.fcntl, 'flock', wait)
   # They would be measured in a world, which is missing here.
   assert kept_stakes.stakes_of(None, None, tmp_path) == found
@@ -207,7 +207,7 @@ def test_a_learner_that_credits_less_than_honesty_earns_is_refused(
 
 @pytest.mark.parametrize('damaged', ['[]', '{}', '3', 'null', '{"key": 5}'])
 def test_damaged_stakes_are_refused_in_one_line(tmp_path, monkeypatch, damaged):
-  monkeypatch.setattr(worlds, 'key_of_stakes', lambda *unused: 'k')
+  monkeypatch.setattr(judging, 'key_of_stakes', lambda *unused: 'k')
   path = tmp_path / kept_stakes.FOLDER / 'k.json'
   path.parent.mkdir()
   path.write_text(damaged)

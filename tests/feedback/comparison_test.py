@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from realab_suite import errors
+from realab_suite import judging
 from realab_suite import policies
 from realab_suite import suite
 from realab_suite import worlds
@@ -173,7 +174,7 @@ def test_who_learns_from_comparisons_is_not_judged_by_their_sum():
   assert design.objective is None
   assert 'learns a reward from comparisons' in design.why_not_judged
   world = worlds.World('unlock_door', 'near')
-  assert worlds.why_no_stakes(world, design) == design.why_not_judged
+  assert judging.why_no_stakes(world, design) == design.why_not_judged
   # One that learns from readings is judged by them, with the defence or not.
   reward = specs.load('instantaneous_reward')
   learner = {

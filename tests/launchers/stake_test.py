@@ -2,6 +2,7 @@
 
 import pytest
 
+from realab_suite import judging
 from realab_suite import worlds
 from realab_suite.feedback import specs
 from realab_suite.launchers import stake
@@ -20,7 +21,7 @@ def fixture_quick_stakes():
 def test_the_stakes_of_a_design_are_printed():
   ended = in_process.run(stake, *_SHORT)
   assert (ended.status, ended.stderr) == (0, '')
-  found = worlds.stakes_of(
+  found = judging.stakes_of(
       worlds.World('unlock_door', 'near', 15),
       specs.load('instantaneous_reward', ['dof=planar']),
   )

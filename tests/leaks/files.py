@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from realab_suite import worlds
+from realab_suite import judging
 from realab_suite.evaluation import monitors
 from realab_suite.evaluation import traces
 from realab_suite.experiments import experiment_specs
@@ -71,7 +71,7 @@ def _run(earn: Callable[..., None] | None) -> dict[str, bytes]:
   ):
     patch.setattr(training, 'make_learner', fake_learner.make)
     # No agent gets them, and measuring takes longer than all the rest.
-    patch.setattr(worlds, 'stakes_of', lambda *args: None)
+    patch.setattr(judging, 'stakes_of', lambda *args: None)
     if earn is not None:
       patch.setattr(base.Task, 'earn', earn)
     path = training.run(

@@ -2,6 +2,7 @@
 
 import pytest
 
+from realab_suite import judging
 from realab_suite import worlds
 from realab_suite.evaluation import stakes
 from realab_suite.evaluation import verdicts
@@ -44,7 +45,7 @@ def test_a_register_at_a_crate_coincides_unless_it_is_secure(
     design, overrides, coincides
 ):
   spec = specs.load(design, ('dof=planar', *overrides))
-  assert worlds.coincides(_TIDY, spec) == coincides
+  assert judging.coincides(_TIDY, spec) == coincides
 
 
 _DECLARED = {
@@ -88,7 +89,7 @@ def test_only_registers_that_the_objective_depends_on_coincide(
   ]
   [paid] = rewards
   data['learner'] = {'kind': 'policy_gradient', 'reward': paid}
-  assert worlds.coincides(_TIDY, specs.load(data)) == coincides
+  assert judging.coincides(_TIDY, specs.load(data)) == coincides
 
 
 def test_the_gain_stands_beside_that_of_the_solver():
@@ -152,9 +153,9 @@ def test_scripted_policies_and_agents_are_not_judged():
 
 
 def test_reports_and_scorecards_say_the_same(tmp_path, monkeypatch):
-  monkeypatch.setattr(worlds, 'obstacles_of', lambda *unused: [])
+  monkeypatch.setattr(judging, 'obstacles_of', lambda *unused: [])
   monkeypatch.setattr(
-      worlds, 'coincides', lambda world, design: design.name == 'tidy_up'
+      judging, 'coincides', lambda world, design: design.name == 'tidy_up'
   )
   run = {'design': 'tidy_up', 'overrides': ['dof=planar'], 'twin': True}
   one = fake_sweep.experiment(

@@ -3,7 +3,7 @@
 import pytest
 
 from realab_suite import errors
-from realab_suite import worlds
+from realab_suite import judging
 from realab_suite.launchers import scorecard
 from realab_suite.reports import scorecard_pages
 from realab_suite.reports import scorecards
@@ -20,8 +20,8 @@ _SCALED = 'registers.reward.scale=0.2'
 @pytest.fixture(autouse=True)
 def _no_worlds(monkeypatch):
   """Loads no world to look for obstacles; each is known."""
-  monkeypatch.setattr(worlds, 'obstacles_of', lambda *unused: [])
-  monkeypatch.setattr(worlds, 'coincides', lambda *unused: False)
+  monkeypatch.setattr(judging, 'obstacles_of', lambda *unused: [])
+  monkeypatch.setattr(judging, 'coincides', lambda *unused: False)
 
 
 def _rows(policy, earned, number=_NUMBER, **options):

@@ -5,8 +5,8 @@ import csv
 import pytest
 
 from realab_suite import errors
+from realab_suite import judging
 from realab_suite import suite
-from realab_suite import worlds
 from realab_suite.evaluation import verdicts
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import publishing
@@ -31,8 +31,8 @@ _LEVELS = {
 def _no_worlds():
   """Loads no world to look for obstacles; each is known."""
   with pytest.MonkeyPatch.context() as patch:
-    patch.setattr(worlds, 'obstacles_of', lambda *unused: [])
-    patch.setattr(worlds, 'coincides', lambda *unused: False)
+    patch.setattr(judging, 'obstacles_of', lambda *unused: [])
+    patch.setattr(judging, 'coincides', lambda *unused: False)
     patch.setattr(fake_sweep, '_LEVELS', _LEVELS)
     yield
 
