@@ -6,7 +6,7 @@ Run from the root of the repository, ten minutes on two busy processors:
 
 It needs the extra `cluster`. Ray is started here, unless RAY_ADDRESS names a
 cluster. `submitit` uses Slurm if `srun` is there, and processes of this machine
-if not; docs/experiments.md has the commands that start Slurm on one machine.
+if not.
 Each engine runs a sweep of four jobs twice. The second time, one learner and
 the worker of another are killed with SIGKILL; with Slurm the learner alone,
 because the cluster of one machine has no accounting, without which submitit

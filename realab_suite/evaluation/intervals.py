@@ -100,8 +100,7 @@ def mean_interval(
   without skewness, it is Student's interval. It is cut off at the bounds.
 
   The campaign `campaigns/statistics_campaign.py` measures the coverage. The
-  figures are in docs/reliability_figures.md (C43), with those of other
-  intervals, such as BCa and Student's on a transformed scale.
+  figures are in docs/reliability.md (C43), beside Student's interval and BCa.
 
   Small samples are reported as follows:
 

@@ -1,7 +1,7 @@
 """A served world keeps its secrets, and planted leaks are found.
 
 Small parts of the campaign `served_secrets`, and the leaks of channels L32 to
-L37 (docs/reliability_figures.md).
+L37 (`NOT_HERE` in tests/leaks/mutants.py).
 """
 
 import ctypes
