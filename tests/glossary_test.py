@@ -135,16 +135,3 @@ def test_an_example_of_clean_contents_is_correct(world_of, row):
 
 def test_every_example_has_a_row():
   assert len(_rows()) == len(_EXAMPLES)
-
-
-def test_the_site_quotes_the_glossary():
-  page = (_PAGE.parent / 'docs' / 'site' / 'concepts.md').read_text()
-  first, _, _ = page.partition('\n## ')
-  quotes = re.findall(r'^- \*\*(.*?)\*\*: (.*)$', first, re.MULTILINE)
-  assert len(quotes) == 6
-  glossary = _PAGE.read_text()
-  assert not [
-      word
-      for word, meaning in quotes
-      if f'\n| {word} | {meaning} ' not in glossary
-  ]
