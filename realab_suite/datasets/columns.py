@@ -1,6 +1,6 @@
 """Columns of the tables of a dataset, with their units and meanings.
 
-`docs/data.md` and the cards of datasets list the same columns.
+The cards of datasets list them.
 """
 
 from typing import Final

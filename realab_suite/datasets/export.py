@@ -4,7 +4,7 @@
     source = sources.of_run(sweep.runs['reward'], num_episodes=20)
     export.export(source, pathlib.Path('results/data'), data_format='parquet')
 
-`docs/data.md` describes the files.
+`docs/doors.md` describes the files.
 """
 
 from collections.abc import Callable, Iterator, Sequence

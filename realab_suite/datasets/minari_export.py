@@ -26,8 +26,8 @@ from realab_suite.experiments import storage
 _ROOT = 'MINARI_DATASETS_PATH'
 _DESCRIPTION = (
     'Episodes of an agent whose feedback is embedded in its world. Rewards are'
-    ' observed rewards, which the agent may have corrupted; see docs/data.md of'
-    ' realab_suite.'
+    ' observed rewards, which the agent may have corrupted; see docs/doors.md'
+    ' of realab_suite.'
 )
 
 

@@ -22,7 +22,7 @@ from realab_suite.feedback import specs
 
 # Agent and evaluator in one process: for honest agents (docs/architecture.md).
 IN_PROCESS = 'T0 in-process'
-# Agents that are served over a socket (docs/served.md).
+# Agents that are served over a socket (docs/doors.md).
 SERVED = 'T1 served to another process of the same user'
 SERVED_TO_ANOTHER_USER = 'T2 served to another user'
 

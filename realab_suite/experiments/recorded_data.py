@@ -1,7 +1,7 @@
 """Recorded episodes, from which learners are trained without acting.
 
 Only the agent's folder of an export is read, so the truth may be elsewhere.
-`docs/data.md` describes it.
+`docs/doors.md` describes it.
 """
 
 from collections.abc import Mapping

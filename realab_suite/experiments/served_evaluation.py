@@ -32,7 +32,7 @@ _WARNING = (
     'the agent may run as the same user as this program (isolation "%s"), so'
     ' its code may access the files and processes of this user. To run it as'
     ' another user, start this program as root with --agent_user'
-    ' (docs/served.md).'
+    ' (docs/doors.md).'
 )
 _NO_CONTROL = (
     'a served run has no control; give the control the same episodes with'

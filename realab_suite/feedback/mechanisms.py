@@ -69,7 +69,7 @@ class FeedbackMechanism(modelled.ModelledEntity):
   """The registers, meters and providers of a design.
 
   `arena.attach(mechanism)` attaches them to the arena of any task; an
-  environment of Composer then runs the design (docs/embedding.md). `attach_to`
+  environment of Composer then runs the design (docs/doors.md). `attach_to`
   does the same for designs with named places. `connect`
   connects the meters to functions of the task.
 

@@ -193,7 +193,7 @@ def _payment(defence: Any, reward: str) -> Payment | str:
   if (weights := one.pays(reward)) is None:
     return (
         f'has the defence {kind!r}, which declares no sum of readings that it'
-        ' pays (`pays` in docs/defences.md)'
+        ' pays (`pays` in docs/your_own.md)'
     )
   if not isinstance(weights, Mapping) or not any(weights.values()):
     raise ValueError(

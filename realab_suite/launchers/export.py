@@ -4,7 +4,7 @@ r"""Exports evaluation episodes of a run of a sweep as data.
     --output=results/data --episodes=20
 
 The folder gets the data of the agent, and the true columns in separate files of
-the evaluator (docs/data.md). The episodes are repeated from their recorded
+the evaluator (docs/doors.md). The episodes are repeated from their recorded
 actions, so the learner is not needed. `label` makes a dataset of several runs.
 """
 

@@ -5,7 +5,7 @@ r"""Makes a labelled dataset of tampering from several designs and policies.
     --policies=apple_seeker,random,carrying_saboteur --seeds=3 --episodes=10
 
 Each step gets the clean contents, the corruption by kind, the part that the
-agent has caused, and the label whether the agent is tampering (docs/data.md).
+agent has caused, and the label whether the agent is tampering (docs/doors.md).
 `--input`, the folder of a sweep, adds the runs of the sweep. The folder gets a
 card with the counts and the columns.
 """

@@ -1,6 +1,6 @@
 r"""Serves a world to an agent in another process, and evaluates the agent.
 
-The agent needs dm_env_rpc and nothing of this package (docs/served.md):
+The agent needs dm_env_rpc and nothing of this package (docs/doors.md):
 
   python -m realab_suite.launchers.serve --task=unlock_door.near \
     --design=instantaneous_reward --seed=1 --episodes=5 \

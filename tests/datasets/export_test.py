@@ -2,7 +2,6 @@
 
 import dataclasses
 import os
-import re
 import stat
 
 import numpy as np
@@ -228,12 +227,3 @@ def test_a_missing_package_is_named(tmp_path, monkeypatch):
   )
   with pytest.raises(errors.ResultsError, match=r'pyarrow \(data\)'):
     export.check('parquet', tmp_path / 'new')
-
-
-def test_the_page_lists_all_columns():
-  page = (made.ROOT / 'docs/data.md').read_text(encoding='utf-8')
-  for table in (columns.AGENT, *columns.EVALUATOR.values()):
-    # The columns of the page are not aligned.
-    text = re.sub(' +', ' ', cards.table_of(table))
-    header, _, *rows = text.splitlines()
-    assert '\n'.join([header, '| --- | --- | --- | --- |', *rows]) in page

@@ -67,7 +67,7 @@ class StepTest(_Served, step.Step):
   def required_actions(self):
     return {1: tensor_utils.pack_tensor(np.zeros(6))}
 
-  # Two things that the protocol leaves open are refused (docs/served.md).
+  # Two things that the protocol leaves open are refused (docs/doors.md).
 
   def test_can_send_variable_dimension_tensor_action(self):
     self.step()

@@ -43,8 +43,8 @@ sys.meta_path.insert(0, Refuse())
 
 
 def _example():
-  page = (served.ROOT / 'docs/served.md').read_text()
-  [block] = re.findall(r'```python\n(.*?)```', page, re.DOTALL)
+  page = (served.ROOT / 'docs/doors.md').read_text()
+  [block] = re.findall(r'```python\n(# agent.py\n.*?)```', page, re.DOTALL)
   return block
 
 

@@ -1,6 +1,5 @@
 """Tests of the command lines of the launchers."""
 
-import ast
 import importlib
 import os
 import pathlib
@@ -12,7 +11,6 @@ import types
 from absl import flags as absl_flags
 from absl.testing import flagsaver
 import pytest
-import yaml
 
 from realab_suite import _display
 from realab_suite import errors
@@ -163,16 +161,11 @@ def test_every_launcher_imports_the_user_s_module(tmp_path):
   # The register, the provider, the task and the design of the page.
   page = (_ROOT / 'docs' / 'your_own.md').read_text()
   blocks = re.findall(r'```python\n(.*?)```', page, re.DOTALL)
-  designs = re.findall(
-      r'^design = (\{\n.*?^\})', page, re.DOTALL | re.MULTILINE
-  )
-  [design] = [text for text in designs if "'watched'" in text]
+  [design] = re.findall(r'```yaml\n(# watched.yaml\n.*?)```', page, re.DOTALL)
   (tmp_path / 'mine.py').write_text(
       '\n'.join(b for b in blocks if 'class ' in b)
   )
-  (tmp_path / 'watched.yaml').write_text(
-      yaml.safe_dump(ast.literal_eval(design))
-  )
+  (tmp_path / 'watched.yaml').write_text(design)
   arguments = [
       '--domain=stay', '--policies=no_op', '--seeds=1', '--episodes=1',
       '--max_steps=3', '--noplots', '--novideos', '--import=mine',

@@ -1,4 +1,4 @@
-"""Wrapper that Gymnasium lacks. See `docs/gymnasium.md` for the others."""
+"""Wrapper that Gymnasium lacks. See `docs/doors.md` for the others."""
 
 import collections
 from typing import Any, final
