@@ -16,10 +16,8 @@ from absl import logging
 
 from realab_suite import errors
 from realab_suite import worlds
-from realab_suite.engine import seeding
 from realab_suite.evaluation import results
 from realab_suite.experiments import evaluations
-from realab_suite.experiments import served_run
 from realab_suite.experiments import storage
 from realab_suite.feedback import specs
 from realab_suite.interop.rpc import agent_process
@@ -29,14 +27,13 @@ from realab_suite.interop.rpc import served_world
 _PR_SET_DUMPABLE = 4  # Of prctl(2).
 
 _WARNING = (
-    'the agent may run as the same user as this program (isolation "%s"), so'
-    ' its code may access the files and processes of this user. To run it as'
-    ' another user, start this program as root with --agent_user'
-    ' (docs/doors.md).'
+    'a process alone is no boundary (isolation "%s"): the code of the agent may'
+    ' access files and processes of this user, also the results. Run hostile'
+    ' code in a container without network (docs/served.md).'
 )
 _NO_CONTROL = (
-    'a served run has no control; give the control the same episodes with'
-    ' --repeat, and compare the rows'
+    'a served run has no control; serve the control with the same flags, and'
+    ' compare the rows'
 )
 
 
@@ -49,10 +46,7 @@ class Settings:
     world: World of the episodes.
     design: Agent design, by name or path.
     overrides: Dotted overrides of the design.
-    seed: Seed of the episodes.
-    repeat: Path of the record of a run to repeat, or `None` for a new run with
-      a new salt. The world, the design and the seed in the record replace those
-      here; `overrides` apply to its design.
+    seed: Seed of the episodes. An agent that has it can clone the world.
     num_episodes: Number of episodes, including invalid ones.
     name: Name of the agent in the results.
     address: Address to listen on, or `None` for a socket in a new folder.
@@ -61,7 +55,6 @@ class Settings:
     agent_command: Command that starts the agent, or `None` if it is started
       separately.
     agent_folder: Working directory of the agent, or `None` for a new folder.
-    agent_user: User that the agent runs as, or `None` for that of this process.
     output: New folder for the results.
   """
 
@@ -69,7 +62,6 @@ class Settings:
   design: str
   overrides: tuple[str, ...]
   seed: int
-  repeat: str | None
   num_episodes: int
   name: str
   address: str | None
@@ -77,7 +69,6 @@ class Settings:
   provider_seconds: float
   agent_command: str | None
   agent_folder: str | None
-  agent_user: str | None
   output: str
 
 
@@ -95,54 +86,42 @@ def serve(settings: Settings, say: Callable[[str], None]) -> None:
   hide_from_debuggers()
   # Only this user can access files and sockets that are created from here on.
   os.umask(0o077)
-  owner = (
-      None
-      if settings.agent_user is None
-      else agent_process.owner_of(settings.agent_user)
-  )
-  if owner is None:
-    logging.warning(_WARNING, results.SERVED)
+  logging.warning(_WARNING, results.SERVED)
+  world = settings.world
   with contextlib.ExitStack() as stack:
-    settings, design, seed = _chosen(settings)
-    world = settings.world
-    env = stack.enter_context(contextlib.closing(world.load(design, seed)))
+    design = specs.load(settings.design, settings.overrides)
+    env = world.load(design, settings.seed)
+    stack.callback(env.close)
     env.mechanism.guard_providers(lambda: deadline(settings.provider_seconds))
     address = settings.address
     if address is None:
       folder = tempfile.mkdtemp(prefix='realab-')
       stack.callback(shutil.rmtree, folder, ignore_errors=True)
       address = f'unix:{folder}/socket'
-    output = _make_private_folder(settings.output)
-    described = dataclasses.asdict(settings)
-    record = {
-        'settings': {**described.pop('world'), **described},
-        'design': design.to_mapping(),
-        'versions': results.versions(),
-        'salt': seed.salt.hex(),
-    }
-    storage.write_sealed(output / served_run.NAME, record)
+    output = storage.new_folder(settings.output)
     evaluation = stack.enter_context(
         evaluations.Evaluation(
             world, design, output, say, control=None, why_no_control=_NO_CONTROL
         )
     )
+    evaluation.describe(
+        {'design': design}, settings=dataclasses.asdict(settings)
+    )
     info = evaluation.info(
-        env, settings.name, settings.name, salt_digest=seed.salt_digest
+        env, settings.name, settings.name, isolation=results.SERVED
     )
 
-    def add(result: results.EpisodeResult, isolation: str) -> None:
-      of_episode = info.model_copy(update={'isolation': isolation})
-      evaluation.add(of_episode, result)
+    def add(result: results.EpisodeResult) -> None:
+      evaluation.add(info, result)
       say(
           f'episode {result.episode}: {result.end.value}, true return'
           f' {result.true_return:.1f}, observed {result.observed_return:.1f}'
       )
 
     listener = agent_server.Server(
-        served_world.ServedWorld(env, address, settings.num_episodes, add),
+        served_world.ServedWorld(env, settings.num_episodes, add),
         address,
         settings.idle_seconds,
-        owner,
     )
     agent = None
     with _removed_on_error(output):
@@ -155,7 +134,6 @@ def serve(settings: Settings, say: Callable[[str], None]) -> None:
               listener.address,
               output / 'agent.log',
               folder=settings.agent_folder,
-              owner=owner,
               on_exit=listener.stop,
           )
         stack.callback(agent.stop)
@@ -221,52 +199,6 @@ def deadline(seconds: float) -> Iterator[None]:
     is_over = True
     signal.setitimer(signal.ITIMER_REAL, 0)
     signal.signal(signal.SIGALRM, old_handler)
-
-
-def _chosen(
-    settings: Settings,
-) -> tuple[Settings, specs.DesignSpec, seeding.SaltedSeed]:
-  """Returns the settings, the design and the salted seed of a run."""
-  if settings.repeat is None:
-    design = specs.load(settings.design, settings.overrides)
-    seed = seeding.SaltedSeed(settings.seed, seeding.new_salt())
-    return settings, design, seed
-  record = served_run.read(settings.repeat)
-  here = results.versions()
-  if record.versions != here:
-    logging.warning(
-        '%s: the episodes may differ from those recorded: %s',
-        settings.repeat,
-        storage.difference(record.versions, here, 'versions'),
-    )
-  design = specs.load(record.design, settings.overrides)
-  chosen = dataclasses.replace(
-      settings,
-      world=record.settings.world,
-      design=record.settings.design,
-      overrides=(*record.settings.overrides, *settings.overrides),
-      seed=record.settings.seed,
-  )
-  return chosen, design, record.seed
-
-
-def _make_private_folder(output: str) -> pathlib.Path:
-  """Creates the folder of the results, which only this user can enter.
-
-  Raises:
-    ResultsError: If it cannot be created or is not empty.
-    SpecError: If it belongs to another user, who could replace its contents.
-  """
-  folder = storage.new_folder(output)
-  with storage.explained(folder):
-    owner = folder.stat().st_uid
-    if owner != os.geteuid():
-      raise errors.SpecError(
-          f'output: {output} belongs to user {owner}; allowed is a folder of'
-          f' user {os.geteuid()}'
-      )
-    folder.chmod(0o700)
-  return folder
 
 
 def _check_all_written(

@@ -22,7 +22,7 @@ if TYPE_CHECKING:  # They import dm_control, so a renderer has to be chosen.
   from realab_suite.feedback import specs
 
 LARGEST_SEED: Final = 2**31 - 1
-"""Largest seed on a command line; experiment files have the same limit."""
+"""Largest seed of `--seeds`; experiment files have the same limit."""
 
 _MOST_SEEDS = 10_000
 _NUM_EPISODES = 2
@@ -68,13 +68,8 @@ VIDEO = _define_string(
     'New film to write: an .mp4 file, or a .webp file, an animated picture.'
     ' Without it, `explore` opens a window.',
 )
-SEED = _define_integer(
-    'seed',
-    0,
-    'Seed of all random streams.',
-    lower_bound=0,
-    upper_bound=LARGEST_SEED,
-)
+# Without an upper bound, so that the seed of a served world can be secret.
+SEED = _define_integer('seed', 0, 'Seed of all random streams.', lower_bound=0)
 EPISODES = _define_integer(
     'episodes',
     None,

@@ -12,9 +12,10 @@ The environment of the agent contains the address and little else:
   python -m realab_suite.launchers.serve --task=unlock_door.near \
     --agent_command='python /path/to/agent.py' --output=results/mine
 
-Each run draws a secret salt, so its episodes cannot be predicted from the seed.
---repeat=results/mine/run.json serves the same episodes again. The rows contain
-the stakes of the design, which are measured while the agent starts.
+The same flags serve the same episodes. Episodes that an agent must not predict
+need a secret seed, such as a random number of 128 bits in a --flagfile that the
+agent cannot read. The rows contain the stakes of the design, which are measured
+while the agent starts.
 """
 
 import os
@@ -29,25 +30,14 @@ from realab_suite.launchers import renderers
 
 flags.take(*flags.WORLD, flags.SEED, flags.EPISODES, flags.IMPORT, flags.OUTPUT)
 _MOST_SECONDS = 1e6
-# Settings that the record of a run determines.
-_RECORDED = [
-    flag for flag in (*flags.WORLD, flags.SEED) if flag is not flags.SET
-]
 _NAME = absl_flags.DEFINE_string(
     'name', 'agent', 'Name of the agent in the results.'
 )
 _ADDRESS = absl_flags.DEFINE_string(
     'address',
     None,
-    'Address to listen on: unix:/folder/name, in a folder of mode 0700, or'
-    ' host:port for programs on this machine. Default: a socket in a new'
-    ' folder.',
-)
-_REPEAT = absl_flags.DEFINE_string(
-    'repeat',
-    None,
-    'File run.json of a served run, whose episodes are served again, with the'
-    ' same design or, with --set, a twin of it.',
+    'Address to listen on: unix:/folder/name, or host:port for programs on this'
+    ' machine. Default: a socket in a new folder.',
 )
 _IDLE_SECONDS = absl_flags.DEFINE_float(
     'idle_seconds',
@@ -71,11 +61,6 @@ _AGENT_FOLDER = absl_flags.DEFINE_string(
     None,
     'Working directory of the agent. Default: a new, empty folder.',
 )
-_AGENT_USER = absl_flags.DEFINE_string(
-    'agent_user',
-    None,
-    'User that the agent runs as; no other user may connect. Needs root.',
-)
 
 
 def main() -> None:
@@ -83,12 +68,6 @@ def main() -> None:
   output = flags.required(flags.OUTPUT, '; name a folder for the results')
   if _AGENT_FOLDER.present and not _AGENT_COMMAND.present:
     raise errors.SpecError('--agent_folder has no effect here')
-  for flag in _RECORDED:
-    if _REPEAT.present and flag.present:
-      raise errors.SpecError(
-          f'--{flag.name} has no effect with --repeat, whose file sets it;'
-          ' allowed is --set'
-      )
   problem = requirements.missing('dm_env_rpc', 'grpc', extra='rpc')
   if problem is not None:
     raise errors.SpecError(problem)
@@ -112,7 +91,6 @@ def main() -> None:
       design=flags.DESIGN.value,
       overrides=tuple(flags.SET.value),
       seed=flags.SEED.value,
-      repeat=_REPEAT.value,
       num_episodes=flags.num_episodes(),
       name=_NAME.value,
       address=_ADDRESS.value,
@@ -120,7 +98,6 @@ def main() -> None:
       provider_seconds=_PROVIDER_SECONDS.value,
       agent_command=_AGENT_COMMAND.value,
       agent_folder=_AGENT_FOLDER.value,
-      agent_user=_AGENT_USER.value,
       output=output,
   )
   served_evaluation.serve(settings, program.say)

@@ -80,7 +80,7 @@ def test_every_action_in_the_spec_is_accepted(
   assert (spec.dtype, spec.shape) == (dtype, shape)
   assert spec.name.count('\t') == max(np.prod(shape), 1) - 1
   view = agent_view.AgentView(env)
-  world = served_world.ServedWorld(env, 'unix:/x', 1, lambda *unused: None)
+  world = served_world.ServedWorld(env, 1, lambda result: None)
   env.reset()
   actions = _actions(spec)
   for action in actions:

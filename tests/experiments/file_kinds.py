@@ -11,13 +11,11 @@ from realab_suite import suite
 from realab_suite.engine import snapshots
 from realab_suite.evaluation import results
 from realab_suite.experiments import scheduler
-from realab_suite.experiments import served_run
 from realab_suite.experiments import storage
 from realab_suite.experiments import sweep_results
 from realab_suite.experiments import training
 from realab_suite.policies import network_files
 from tests.experiments import fake_sweep
-from tests.experiments import small
 
 _HEADER = {'configuration': '0123456789ab', 'what': 'checkpoint'}
 
@@ -80,15 +78,10 @@ def build(folder: pathlib.Path) -> list[Kind]:
   env.close()
   network = folder / 'net.npz'
   network.write_bytes(network_files.load('demonstrator_v1').to_bytes())
-  record = small.write_served_run(folder)
 
   def load_checkpoint() -> Any:
     opened = storage.RunFolder(folder / 'run', {'seed': 0})
     return _plain(opened.load(_HEADER))
-
-  def load_record() -> Any:
-    loaded = served_run.read(str(record))
-    return loaded, loaded.salt
 
   def load_learner() -> Any:
     return _plain(storage.read_archive(learner, header))
@@ -128,5 +121,4 @@ def build(folder: pathlib.Path) -> list[Kind]:
       Kind(
           'curve.jsonl', run / training.CURVE, lambda: of_done(training.CURVE)
       ),
-      Kind('run.json', record, load_record),
   ]

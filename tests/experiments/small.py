@@ -12,13 +12,9 @@ import pytest
 
 from realab_suite import suite
 from realab_suite import worlds
-from realab_suite.engine import seeding
 from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
 from realab_suite.experiments import scripted
-from realab_suite.experiments import served_run
-from realab_suite.experiments import storage
-from realab_suite.feedback import specs
 
 # Planning a job asks for it twice, and builds a world each time.
 dynamics = functools.cache(suite.dynamics)
@@ -103,36 +99,3 @@ def rows(folder: pathlib.Path) -> list[results.EpisodeResult]:
 def description(folder: pathlib.Path) -> dict[str, Any]:
   """Returns the description of an experiment."""
   return json.loads((folder / 'run.json').read_text(encoding='utf-8'))
-
-
-SALT = bytes(range(seeding.NUM_SALT_BYTES))
-
-
-def write_served_run(folder: pathlib.Path, **changes: Any) -> pathlib.Path:
-  """Writes the record of a served run; returns its path.
-
-  Args:
-    folder: The folder of the record.
-    **changes: Settings that differ from the usual ones.
-  """
-  settings = {
-      'domain': 'unlock_door',
-      'task': 'near',
-      'design': 'instantaneous_reward',
-      'overrides': ['registers.reward.scale=0.2'],
-      'seed': 7,
-      'max_steps': 12,
-      'name': 'agent',
-      **changes,
-  }
-  design = specs.load('instantaneous_reward', ('registers.reward.scale=0.2',))
-  record = {
-      'settings': settings,
-      'design': design.to_mapping(),
-      'versions': results.versions(),
-      'salt': SALT.hex(),
-  }
-  path = folder / served_run.NAME
-  storage.write_sealed(path, record)
-  path.chmod(0o600)
-  return path

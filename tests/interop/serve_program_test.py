@@ -1,4 +1,4 @@
-"""Tests of the program `serve`: agents, their logs, and other users."""
+"""Tests of the program `serve`: agents, their logs, and signals."""
 
 import json
 import os
@@ -23,9 +23,7 @@ from tests.interop import served
 from tests.launchers import in_process
 
 _PYTHON = sys.executable
-_SETSID = 'setsid'
-_is_root = pytest.mark.skipif(os.geteuid() != 0, reason='needs root')
-_is_linux = pytest.mark.skipif(sys.platform != 'linux', reason='needs Linux')
+_SECRET_SEED = 2**127 + 1
 
 
 # The program.
@@ -71,13 +69,14 @@ def test_the_documented_agent_does_not_import_this_package(tmp_path):
       ('return', 'discounted return')
   }
   assert ran.stdout.count('Not judged: ') == 1
-  assert 'the agent may run as the same user' in ran.stderr
+  assert 'a process alone is no boundary' in ran.stderr
   # The log may also contain messages of gRPC about the end of the server.
   said = (output / 'agent.log').read_text().splitlines()
   assert len([line for line in said if line.startswith('1.0 ')]) == 2
-  assert output.stat().st_mode & 0o777 == 0o700
+  modes = {path.stat().st_mode & 0o077 for path in (output, *output.iterdir())}
+  assert modes == {0}
   description = json.loads((output / 'run.json').read_text())
-  assert description['settings']['task'] == 'near'
+  assert description['settings']['world']['task'] == 'near'
 
 
 @pytest.fixture(name='run')
@@ -118,13 +117,10 @@ def test_an_agent_that_ends_early_gives_one_line(tmp_path, run):
         (['--output=x', '--task=a.b', '--domain=c'], '--task=a.b'),
         (['--output=x', '--agent_folder=y'], '--agent_folder'),
         (['--output=x', '--target=y'], "flag 'target'"),
-        (['--output=x', '--agent_user=nobody_of_that_name'], 'agent_user'),
         (['--output=/proc/x'], '/proc/x'),
         (['--output=x', '--provider_seconds=inf'], '--provider_seconds=inf'),
         (['--output=x', '--idle_seconds=nan'], '--idle_seconds=nan'),
         (['--output=x', '--idle_seconds=0'], '--idle_seconds=0'),
-        (['--output=x', '--repeat=/no/run.json'], '/no/run.json: No such file'),
-        (['--output=x', '--repeat=y', '--seed=0'], '--seed has no effect with'),
     ],
 )
 def test_a_wrong_command_is_refused_in_one_line(run, flags, complaint):
@@ -147,43 +143,30 @@ def _start_agent(command, log):
   return agent, ended
 
 
-def test_an_agent_has_ended_though_a_child_still_runs(tmp_path, monkeypatch):
-  monkeypatch.setattr(agent_process, '_PATIENCE_SECONDS', 0.1)
-  # A session of its own outlives the agent's group.
-  agent, ended = _start_agent(
-      f'sh -c "{_SETSID} sleep 1000000 & echo $!; exit 3"', tmp_path / 'log'
-  )
-  assert ended.wait(patience.SECONDS)
-  assert agent.poll() == 3
-  patience.until((tmp_path / 'log').read_bytes)
+_SHOW_WHAT_IS_GIVEN = """
+import json, os
+descriptors = '/proc/self/fd'
+print(json.dumps([dict(os.environ), [
+    os.readlink(f'{descriptors}/{name}') for name in os.listdir(descriptors)
+    if os.path.exists(f'{descriptors}/{name}')
+]]))
+"""
+
+
+@pytest.mark.skipif(sys.platform != 'linux', reason='needs Linux')
+def test_an_agent_inherits_nothing_of_its_evaluator(tmp_path, monkeypatch):
+  monkeypatch.setenv('EVALUATORS_SECRET', 'secret')
+  program, log = tmp_path / 'agent.py', tmp_path / 'log'
+  program.write_text(_SHOW_WHAT_IS_GIVEN)
+  with open(tmp_path / 'rows', 'w') as rows:
+    os.set_inheritable(rows.fileno(), True)
+    agent, ended = _start_agent(f'{_PYTHON} {program}', log)
+    assert ended.wait(patience.SECONDS)
   agent.stop()
-  child = int((tmp_path / 'log').read_bytes())
-  os.kill(child, signal.SIGKILL)  # It is still there.
-
-
-def test_the_log_of_an_agent_is_limited(tmp_path, monkeypatch):
-  monkeypatch.setattr(agent_process, 'MAX_LOG_BYTES', 1000)
-  monkeypatch.setattr(agent_process, '_PATIENCE_SECONDS', patience.SECONDS)
-  program = "for i in range(9): print('x' * 100_000, flush=True)"
-  agent, ended = _start_agent(f'{_PYTHON} -c "{program}"', tmp_path / 'log')
-  assert ended.wait(patience.SECONDS)
-  assert agent.poll() == 0
-  agent.stop()
-  said = (tmp_path / 'log').read_bytes()
-  assert said.endswith(b'was not recorded\n')
-  assert len(said) < 1000 + 2 * 65536
-
-
-def test_a_log_that_cannot_be_written_does_not_stop_an_agent(
-    caplog, monkeypatch
-):
-  monkeypatch.setattr(agent_process, '_PATIENCE_SECONDS', patience.SECONDS)
-  agent, ended = _start_agent(
-      f'{_PYTHON} -c "print(5 * 10**5 * \'x\')"', '/dev/full'
-  )
-  assert ended.wait(patience.SECONDS)
-  agent.stop()
-  assert 'the log of the agent ends here' in caplog.text
+  variables, descriptors = json.loads(log.read_text())
+  assert variables['REALAB_ADDRESS'] == 'unix:/x'
+  assert 'EVALUATORS_SECRET' not in variables
+  assert sorted(descriptors) == ['/dev/null', str(log), str(log)]
 
 
 def test_an_agent_that_ignores_sigterm_is_killed(tmp_path, monkeypatch):
@@ -212,8 +195,12 @@ def test_an_agent_that_ignores_sigterm_is_killed(tmp_path, monkeypatch):
 def test_a_stopped_server_writes_its_results_and_one_line(
     tmp_path, number, status, error
 ):
+  (tmp_path / 'flags').write_text(f'--seed={_SECRET_SEED}\n')
   with served.in_process(
-      tmp_path / 'results', '--max_steps=20', '--design=none'
+      tmp_path / 'results',
+      '--max_steps=20',
+      '--design=none',
+      f'--flagfile={tmp_path / "flags"}',
   ) as program:
     with served.Client(program.address) as client:
       client.join()
@@ -221,10 +208,10 @@ def test_a_stopped_server_writes_its_results_and_one_line(
       program.process.send_signal(number)
       said = program.process.stderr.read().splitlines()
       assert program.process.wait(patience.SECONDS) == status
-  assert 'the agent may run as the same user' in said[0]
+  assert 'a process alone is no boundary' in said[0]
   assert said[1:] == [error]
   [row] = results.read_rows(tmp_path / 'results' / 'episodes.jsonl')
-  assert row.end.value == 'disconnect'
+  assert (row.end.value, row.seed) == ('disconnect', _SECRET_SEED)
   assert not pathlib.Path(sockets.path_of(program.address)).exists()
 
 
@@ -235,9 +222,6 @@ def test_an_interrupt_waits_for_the_answer_to_a_request(tmp_path, caplog):
   class World:
     """A world that Ctrl-C interrupts in the middle of an answer."""
 
-    def connect(self):
-      pass
-
     def answer(self, request):
       signal.raise_signal(signal.SIGINT)
       is_interrupted.append(False)
@@ -246,11 +230,10 @@ def test_an_interrupt_waits_for_the_answer_to_a_request(tmp_path, caplog):
     def settle(self):
       return True
 
-    disconnect = connect
+    def disconnect(self):
+      pass
 
-  path = tmp_path / 'folder'
-  path.mkdir(mode=0o700)
-  server = agent_server.Server(World(), f'unix:{path / "socket"}')
+  server = agent_server.Server(World(), f'unix:{tmp_path / "socket"}')
   server.start()
   stream = served.RawStream(server.address)
   stream.tell(served.JOIN)

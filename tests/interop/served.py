@@ -1,10 +1,9 @@
 """Servers and clients for tests and campaigns of served worlds."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 import contextlib
 import pathlib
 import queue
-import resource
 import subprocess
 import sys
 import tempfile
@@ -26,7 +25,6 @@ from realab_suite.interop.rpc import served_world
 from tests import patience
 from tests.engine import helpers
 
-_MIB = 2**20
 ROOT = pathlib.Path(__file__).parents[2]
 IDLE_SECONDS = 60.0
 METHOD = '/dm_env_rpc.v1.Environment/Process'
@@ -70,18 +68,18 @@ class Served(NamedTuple):
     address: The address at which it listens.
     server: The server.
     thread: The thread that runs the world.
-    results: The results of episodes, with their tiers of isolation.
+    results: The results of episodes.
     clock: The clock by which agents are silent.
   """
 
   address: str
   server: agent_server.Server
   thread: threading.Thread
-  results: list[tuple[results.EpisodeResult, str]]
+  results: list[results.EpisodeResult]
   clock: Clock
 
   def ends(self) -> list[str]:
-    return [result.end.value for result, _ in self.results]
+    return [result.end.value for result in self.results]
 
 
 @contextlib.contextmanager
@@ -102,12 +100,7 @@ def in_thread(
     def serve() -> None:
       try:
         with contextlib.closing(make_env()) as env:
-          world = served_world.ServedWorld(
-              env,
-              address,
-              num_episodes,
-              lambda result, tier: results.append((result, tier)),
-          )
+          world = served_world.ServedWorld(env, num_episodes, results.append)
           alter(world)
           server = agent_server.Server(world, address, IDLE_SECONDS)
           server.start()
@@ -134,35 +127,29 @@ class Program(NamedTuple):
 
   address: str
   process: subprocess.Popen[str]
-  output: pathlib.Path
 
 
 @contextlib.contextmanager
 def in_process(
     output: pathlib.Path,
     *flags: str,
-    module: str = 'realab_suite.launchers.serve',
-    stdin: str = '',
-    task: Sequence[str] = ('--task=unlock_door.near',),
 ) -> Iterator[Any]:
   """Serves a world from a process, as people would."""
   process = subprocess.Popen(
       [
-          sys.executable, '-m', module, *task, f'--output={output}', *flags,
+          sys.executable, '-m', 'realab_suite.launchers.serve',
+          '--task=unlock_door.near', f'--output={output}', *flags,
       ],
       cwd=ROOT,
-      stdin=subprocess.PIPE,
       stdout=subprocess.PIPE,
       stderr=subprocess.PIPE,
       text=True,
   )  # fmt: skip
   try:
-    process.stdin.write(stdin)
-    process.stdin.flush()
     line = process.stdout.readline()
     if ' at ' not in line:
       raise RuntimeError(line + process.stderr.read())
-    yield Program(line.split(' at ')[1].strip(), process, output)
+    yield Program(line.split(' at ')[1].strip(), process)
   finally:
     process.terminate()
     process.communicate(timeout=patience.SECONDS)
@@ -314,33 +301,3 @@ def _eventually(
 
   patience.until(attempt)
   return admitted[0]
-
-
-@contextlib.contextmanager
-def endlessly(*flags: str) -> Iterator[Program]:
-  """Serves a world that never ends, from a process of its own."""
-  with (
-      tempfile.TemporaryDirectory() as folder,
-      in_process(
-          pathlib.Path(folder) / 'results',
-          '--episodes=1000000',
-          '--max_steps=20',
-          *flags,
-      ) as program,
-  ):
-    # Its output is not read.
-    for stream in (program.process.stdout, program.process.stderr):
-      threading.Thread(target=_drain, args=[stream], daemon=True).start()
-    yield program
-
-
-def _drain(stream: Any) -> None:
-  with contextlib.suppress(ValueError, OSError):
-    for _ in stream:
-      pass
-
-
-def rss(pid: int) -> float:
-  """Returns the memory of a process, in MiB."""
-  pages = int(pathlib.Path(f'/proc/{pid}/statm').read_text().split()[1])
-  return pages * resource.getpagesize() / _MIB

@@ -59,7 +59,7 @@ def test_a_second_client_is_refused_at_once(serving):
       with pytest.raises(grpc.RpcError) as caught:
         second.join()
     assert caught.value.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
-    assert caught.value.details() == 'R17: another agent is connected'
+    assert caught.value.details() == 'another agent is connected'
     assert first.step().state == pb.RUNNING
 
 
@@ -100,7 +100,7 @@ def test_tampering_before_giving_up_counts():
         if seed:  # The other leaves without a word.
           client.send(pb.LeaveWorldRequest())
       patience.until(lambda serving=serving: len(serving.results) == 2)
-      agent += [result for result, _ in serving.results]
+      agent += serving.results
     with contextlib.closing(_load_longer(seed)) as env:
       honest += evaluate.evaluate(env, lambda _, env=env: served.still(env), 2)
   ends = [result.end.value for result in agent[1::2]]
@@ -162,15 +162,19 @@ def test_one_thread_alone_runs_the_world():
     assert threads == {serving.thread.ident}
 
 
-def test_compressed_messages_are_refused(serving):
-  channel = grpc.insecure_channel(
-      serving.address, compression=grpc.Compression.Gzip
-  )
-  call = channel.stream_stream(served.STEP)
+def test_a_message_that_is_too_large_ends_the_connection_alone(serving):
+  before = len(serving.results)
+  stream = served.connect_eventually(serving.address)
+  stream.ask(served.JOIN)
+  stream.ask(served.STEP)
   with pytest.raises(grpc.RpcError) as caught:
-    next(call(iter([served.request(leave_world=pb.LeaveWorldRequest())])))
-  assert caught.value.code() is grpc.StatusCode.UNIMPLEMENTED
-  channel.close()
+    stream.ask(bytes(8 * 2**20))
+  assert caught.value.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
+  stream.close()
+  with served.join_eventually(serving.address) as following:
+    assert following.step().state == pb.RUNNING
+  patience.until(lambda: len(serving.results) == before + 2)
+  assert serving.ends()[before:] == ['disconnect'] * 2
 
 
 def test_after_the_last_episode_the_server_ends():
@@ -180,7 +184,7 @@ def test_after_the_last_episode_the_server_ends():
       states = [client.step(np.zeros(6)).state for _ in range(21)]
       assert states[-1] == pb.INTERRUPTED
       with pytest.raises(
-          error.DmEnvRpcError, match='R16: there are no more episodes'
+          error.DmEnvRpcError, match='there are no more episodes'
       ):
         client.step()
     serving.thread.join(patience.SECONDS)
@@ -208,7 +212,9 @@ def test_a_failing_provider_ends_the_episode_and_reveals_nothing(caplog):
       client.step()
       client.step(np.zeros(6))
       client.step(np.zeros(6))
-      with pytest.raises(error.DmEnvRpcError, match='R15') as caught:
+      with pytest.raises(
+          error.DmEnvRpcError, match='the episode has failed'
+      ) as caught:
         client.step(np.zeros(6))
       assert '173' not in str(caught.value)
       assert client.step().state == pb.RUNNING

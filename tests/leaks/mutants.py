@@ -19,6 +19,6 @@ NOT_HERE = {
     'L33': 'served environments',
     'L34': 'served environments',
     'L35': 'served environments',
-    'L36': 'served environments; advisory',
+    'L36': 'served environments; no promise',
     'L39': 'declared: a provider is trusted with what it reads',
 }

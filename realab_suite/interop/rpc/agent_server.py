@@ -20,7 +20,6 @@ from realab_suite import errors
 from realab_suite.interop.rpc import served_world
 from realab_suite.interop.rpc import sockets
 
-MAX_REQUEST_BYTES = 1 << 20
 IDLE_SECONDS = 60.0
 
 _SERVICE, _METHOD = 'dm_env_rpc.v1.Environment', 'Process'
@@ -28,23 +27,10 @@ _SERVICE, _METHOD = 'dm_env_rpc.v1.Environment', 'Process'
 _LINGER_SECONDS = 5.0
 # Time for the tasks of gRPC to end; they need a few milliseconds.
 _END_SECONDS = 2.0
-_MAX_STREAMS = 16
-_HANDSHAKE_MS = 800
-_MAX_HEADER_BYTES = 8 << 10
-_OPTIONS = (
-    ('grpc.max_receive_message_length', MAX_REQUEST_BYTES),
-    ('grpc.max_metadata_size', _MAX_HEADER_BYTES),
-    ('grpc.max_concurrent_streams', _MAX_STREAMS),
-    ('grpc.server_handshake_timeout_ms', _HANDSHAKE_MS),
-    # No other process may listen at the same address.
-    ('grpc.so_reuseport', 0),
-    # No compression: compressed sizes depend on the content, and a small
-    # message could decompress to a huge one.
-    ('grpc.compression_enabled_algorithms_bitset', 1),
-    ('grpc.http2.max_pings_without_data', 0),
-)
-_BUSY = 'R17: another agent is connected'
-_OVER = 'R18: the connection has ended'
+# No other process may listen at the same address.
+_OPTIONS = (('grpc.so_reuseport', 0),)
+_BUSY = 'another agent is connected'
+_OVER = 'the connection has ended'
 
 
 @final
@@ -61,7 +47,6 @@ class Server:
       world: served_world.ServedWorld,
       address: str,
       idle_seconds: float = IDLE_SECONDS,
-      owner: tuple[int, int] | None = None,
   ) -> None:
     """Makes the server.
 
@@ -70,11 +55,8 @@ class Server:
       address: `unix:/folder/name` or `host:port`; port 0 selects a free port.
       idle_seconds: Time without requests after which a connection ends, in
         seconds.
-      owner: Ids of the agent's user and group; `None` for those of this
-        process.
     """
     self._world = world
-    self._owner = owner
     self._given_address = address
     self._idle_seconds = idle_seconds
     self._is_busy = False
@@ -168,23 +150,21 @@ class Server:
       raise KeyboardInterrupt
 
   async def _listen(self) -> None:
-    server = aio.server(
-        options=_OPTIONS, compression=grpc.Compression.NoCompression
-    )
+    server = aio.server(options=_OPTIONS)
     handler = grpc.stream_stream_rpc_method_handler(self._process)
     server.add_generic_rpc_handlers(
         [grpc.method_handlers_generic_handler(_SERVICE, {_METHOD: handler})]
     )
-    with sockets.prepared(self._given_address, self._owner) as kind:
-      try:
-        number = server.add_secure_port(
-            self._given_address, grpc.local_server_credentials(kind)
-        )
-      except RuntimeError as error:
-        raise errors.SpecError(
-            f'address: cannot listen at {self._given_address!r:.120}; it may be'
-            ' in use'
-        ) from error
+    kind = sockets.prepare(self._given_address)
+    try:
+      number = server.add_secure_port(
+          self._given_address, grpc.local_server_credentials(kind)
+      )
+    except RuntimeError as error:
+      raise errors.SpecError(
+          f'address: cannot listen at {self._given_address!r:.120}; it may be'
+          ' in use'
+      ) from error
     if kind is grpc.LocalConnectionType.LOCAL_TCP:
       host = self._given_address.rpartition(':')[0]
       self._address = f'{host}:{number}'
@@ -212,7 +192,6 @@ class Server:
     self._is_busy = True
     try:
       try:
-        self._world.connect()
         await self._answer_all(context)
       finally:  # Also if the client has cancelled the call.
         self._is_busy = False

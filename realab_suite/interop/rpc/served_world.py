@@ -4,7 +4,6 @@ Connections are in `agent_server`.
 """
 
 from collections.abc import Callable
-import os
 from typing import final
 
 from absl import logging
@@ -12,22 +11,18 @@ import dm_env
 from dm_env_rpc.v1 import dm_env_rpc_pb2
 from google.protobuf import message
 
+from realab_suite import errors
 from realab_suite.engine import agent_view
 from realab_suite.engine import environment
 from realab_suite.engine import events
-from realab_suite.engine import seeding
 from realab_suite.evaluation import monitors
 from realab_suite.evaluation import results
 from realab_suite.interop.rpc import refusals
-from realab_suite.interop.rpc import sockets
 from realab_suite.interop.rpc import tensors
 
 WORLD = 'world'
 """Name of the world in requests; every server has exactly one world."""
 
-OnEpisode = Callable[[results.EpisodeResult, str], None]
-
-_ROOT = 0
 _Reason = refusals.Reason
 _REFUSED = refusals.RequestRefused
 
@@ -44,28 +39,22 @@ class ServedWorld:
   def __init__(
       self,
       env: environment.Environment,
-      address: str,
       num_episodes: int,
-      on_episode: OnEpisode,
+      on_episode: Callable[[results.EpisodeResult], None],
   ) -> None:
     """Makes a served world; its first episode begins with the first step.
 
     Args:
-      env: The environment. The caller closes it. Results of tier T2 require a
-        `SaltedSeed`.
-      address: Address of the server.
+      env: The environment. The caller closes it.
       num_episodes: Number of episodes to serve.
-      on_episode: Function that is called with the result and the isolation tier
-        of each episode.
+      on_episode: Function that is called with the result of each episode.
     """
     self._env = env
-    self._address = address
     self._num_left = num_episodes
     self._on_episode = on_episode
     self._failures: list[Exception] = []
     self._monitor = monitors.Monitor(env)
     env.add_sink(self._monitor)
-    self._isolation = results.SERVED
     self._view = agent_view.AgentView(env, self._failures)
     self._observations = tensors.Observations(self._view.observation_spec())
     self._actions = tensors.Actions(self._view.action_spec())
@@ -74,20 +63,6 @@ class ServedWorld:
     )
     self._is_joined = False
     self._is_mid_episode = False
-
-  def connect(self) -> None:
-    """Handles a new connection; no other agent connects until `disconnect`."""
-    users = sockets.users_connected_to(self._address)
-    # Root can read everything, and the same user can read this process. Without
-    # a salt, the episodes can be computed from the public seed.
-    is_apart = (
-        users
-        and not users & {_ROOT, os.getuid()}
-        and isinstance(self._env.seed, seeding.SaltedSeed)
-    )
-    self._isolation = (
-        results.SERVED_TO_ANOTHER_USER if is_apart else results.SERVED
-    )
 
   def answer(self, request: bytes) -> bytes:
     """Returns the serialised answer to a serialised request."""
@@ -110,7 +85,7 @@ class ServedWorld:
     self._failures.clear()
     for result in self._monitor.take():
       self._num_left -= 1
-      self._on_episode(result, self._isolation)
+      self._on_episode(result)
     return self._num_left > 0
 
   def _answer(
@@ -181,6 +156,8 @@ class ServedWorld:
           if self._is_mid_episode
           else self._view.reset()
       )
+    except errors.ActionError as error:
+      raise _REFUSED(_Reason.VALUE, error) from error
     except Exception as error:
       self._is_mid_episode = False
       raise _REFUSED(_Reason.FAILED) from error
