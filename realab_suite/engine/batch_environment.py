@@ -76,7 +76,7 @@ class BatchEnvironment:
     )
     self._random_state = seeding.random_state(single.seed, 0, 0, 'batch')
     # `restore` may give several worlds the same number. Arrays of objects keep
-    # large seeds and salts; `np.full` would drop the salt.
+    # large seeds.
     self._seeds = seeding.seeds(single.seed, num_envs)
     self._world_numbers = np.arange(num_envs).astype(object)
     self._episodes = np.full(num_envs, -1)

@@ -18,15 +18,12 @@ from realab_suite import errors
 from realab_suite import trees
 from realab_suite.config import messages
 from realab_suite.engine import arguments
-from realab_suite.engine import seeding
 from realab_suite.entities import state
 
 _KIND = 'snapshot'
 # Version of the contents. Since version 2, states of providers are those of
-# `clean_contents`.
-_VERSION = 2
-# Key of the salts, in snapshots of worlds with salted seeds.
-_SALTS = 'salts'
+# `clean_contents`; since version 3, seeds have no salts.
+_VERSION = 3
 # Key of `WorldStates.indices`, kept from version 0.1.
 _INDICES = 'places'
 _INTEGRATION = mujoco.mjtState.mjSTATE_INTEGRATION
@@ -151,24 +148,12 @@ class WorldStates(NamedTuple):
     """Returns the states of worlds from the result of `to_data`."""
     fields = dict(data)
     fields['indices'] = fields.pop(_INDICES)
-    salts = fields.pop(_SALTS, None)
-    if salts is not None:
-      fields['seed'] = [
-          seeding.SaltedSeed(seed, bytes.fromhex(salt)) if salt else seed
-          for seed, salt in zip(fields['seed'], salts, strict=True)
-      ]
     return cls(**fields)
 
   def to_data(self) -> dict[str, Any]:
-    """Returns the states of worlds as plain data, including salts."""
-    data = {**self._asdict(), 'seed': [int(seed) for seed in self.seed]}
+    """Returns the states of worlds as plain data."""
+    data = self._asdict()
     data[_INDICES] = data.pop('indices')
-    salts = [
-        seed.salt.hex() if isinstance(seed, seeding.SaltedSeed) else None
-        for seed in self.seed
-    ]
-    if any(salts):
-      data[_SALTS] = salts
     return data
 
   def provider_states_of_world(self) -> list[Any]:
