@@ -2,18 +2,16 @@
 
 from dm_env_rpc.v1 import dm_env_rpc_pb2 as pb
 from dm_env_rpc.v1 import tensor_utils
-from google.rpc import code_pb2
+from dm_env_rpc.v1.extensions import properties_pb2
+from google.protobuf import any_pb2
 import numpy as np
 import pytest
 
 from realab_suite.engine import events
+from realab_suite.interop.rpc import refusals
 from realab_suite.interop.rpc import served_world
 from tests.engine import helpers
 from tests.interop import served
-
-_DENIED = code_pb2.PERMISSION_DENIED
-_TOO_EARLY = code_pb2.FAILED_PRECONDITION
-_INVALID = code_pb2.INVALID_ARGUMENT
 
 
 def _make(design='instantaneous_reward', max_steps=20):
@@ -58,6 +56,68 @@ def _running(port):
   _join(port)
   assert _step(port).step.state == pb.RUNNING
   return port
+
+
+def _properties():
+  read = properties_pb2.ReadPropertyRequest(key='score')
+  request = any_pb2.Any()
+  request.Pack(properties_pb2.PropertyRequest(read_property=read))
+  return served.request(extension=request)
+
+
+_SETTINGS = {'seed': tensor_utils.pack_tensor(1)}
+_REFUSED = {
+    'bytes that are no message': ('UNREADABLE', b'\xff' * 40),
+    'no bytes': ('EMPTY', b''),
+    'another world': (
+        'WORLD',
+        served.request(join_world=pb.JoinWorldRequest(world_name='another')),
+    ),
+    'settings of a world': (
+        'SETTINGS',
+        served.request(
+            join_world=pb.JoinWorldRequest(
+                world_name='world', settings=_SETTINGS
+            )
+        ),
+    ),
+    'settings of a reset': (
+        'SETTINGS',
+        served.JOIN,
+        served.request(reset=pb.ResetRequest(settings=_SETTINGS)),
+    ),
+    'a new world': (
+        'NOT_FOR_AGENTS',
+        served.request(create_world=pb.CreateWorldRequest()),
+    ),
+    'a property': ('NOT_FOR_AGENTS', served.JOIN, _properties()),
+    'a step before joining': ('NOT_JOINED', served.STEP),
+    'a reset before joining': ('NOT_JOINED', served.RESET),
+    'a step after leaving': (
+        'NOT_JOINED', served.JOIN, served.LEAVE, served.STEP,
+    ),
+    'joining twice': ('JOINED', served.JOIN, served.JOIN),
+    'a reset in mid-episode': (
+        'MID_EPISODE', served.JOIN, served.STEP, served.RESET,
+    ),
+    'an unknown observation': (
+        'OBSERVATION',
+        served.JOIN,
+        served.request(step=pb.StepRequest(requested_observations=[99])),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize('what', _REFUSED)
+def test_a_wrong_request_is_refused_and_the_world_goes_on(what, port):
+  name, *requests, wrong = _REFUSED[what]
+  code, text = refusals.Reason[name].value
+  for request in requests:
+    assert not served.response(port.answer(request)).HasField('error')
+  error = served.response(port.answer(wrong)).error
+  assert (error.code, error.message) == (code, text.format(99))
+  _join(port)
+  assert _step(port, _no_op()).step.state == pb.RUNNING
 
 
 def test_leaving_abandons_the_episode():
@@ -113,10 +173,11 @@ def test_a_bad_action_is_refused_and_changes_nothing(what, running, env):
   before = env.save().to_bytes()
   tensor, start, end = _BAD_ACTIONS[what]
   error = _step(running, tensor).error
-  assert error.code == _INVALID
+  assert error.code == refusals.Reason.OTHER_SPEC.value[0]
   assert error.message.startswith(start)
   assert error.message.endswith(end)
   assert env.save().to_bytes() == before
+  assert _ask(running, reset=pb.ResetRequest()).HasField('error')  # It runs.
   assert _step(running, _no_op()).step.state == pb.RUNNING
 
 
