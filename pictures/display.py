@@ -1,6 +1,7 @@
 """The display: what is seen from its reading point, and by whom it is faked."""
 
 import contextlib
+import importlib
 import pathlib
 from typing import Any, NamedTuple, final
 
@@ -67,6 +68,7 @@ def draw(path: pathlib.Path) -> None:
   Args:
     path: PNG file to write.
   """
+  importlib.import_module('examples.display')  # It adds the kind.
   width, height = (pixels / _DOTS_PER_INCH for pixels in SIZE)
   canvas = figure.Figure(
       (width, height), dpi=_DOTS_PER_INCH, layout='constrained'

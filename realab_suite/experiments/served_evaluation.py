@@ -29,7 +29,7 @@ _PR_SET_DUMPABLE = 4  # Of prctl(2).
 _WARNING = (
     'a process alone is no boundary (isolation "%s"): the code of the agent may'
     ' access files and processes of this user, also the results. Run hostile'
-    ' code in a container without network (docs/served.md).'
+    ' code in a container without network (docs/doors.md).'
 )
 _NO_CONTROL = (
     'a served run has no control; serve the control with the same flags, and'

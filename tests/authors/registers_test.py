@@ -28,15 +28,6 @@ _KINDS: dict[str, tuple[type[registers.Register], dict[str, Any]]] = {
     'an abacus': (abacus.Abacus, {}),
     'abacus_2': (registers.Abacus2, {}),
     'abacus_4': (registers.Abacus4, {'value_range': (-1, 1), 'scale': 0.3}),
-    'display': (registers.Display, {}),
-    'display in centimetres': (
-        registers.Display,
-        {'value_range': (0, 900), 'scale': 0.01, 'tiles': 4, 'write': 'pose'},
-    ),
-    'display that corrects errors': (
-        registers.Display,
-        {'tiles': 12, 'code': 'ecc', 'block_size': 0.15, 'initial': -1.3},
-    ),
 }  # fmt: skip
 
 

@@ -1,0 +1,237 @@
+"""The display of the examples: a register that is read from a distance.
+
+It stands at the origin, with tiles 0.22, 0.44 and 0.66 m from the base block,
+and is read from 1.5 m in front of the second tile.
+"""
+
+import importlib
+import pathlib
+import sys
+from typing import Any, NamedTuple, final
+
+import numpy as np
+import pytest
+
+from realab_suite import errors
+from realab_suite import suite
+from realab_suite import testing
+from realab_suite.evaluation import attribution
+from tests import registries
+from tests.evaluation import staged
+
+_EXAMPLES = pathlib.Path(__file__).parents[2] / 'examples'
+_OPTIONS = {'tiles': 3, 'point': [0.44, 1.5, 1.8]}
+_RIGHT = -np.pi / 2
+_WAIT = (4, {})
+# Tiles of each level: raised (1) or lowered (0).
+_GRAY = (
+    (0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0),
+    (0, 1, 1), (1, 1, 1), (1, 0, 1), (0, 0, 1),
+)  # fmt: skip
+
+
+@pytest.fixture(name='example')
+def fixture_example(monkeypatch):
+  monkeypatch.syspath_prepend(str(_EXAMPLES))
+  monkeypatch.delitem(sys.modules, 'display', raising=False)
+  with registries.preserved():
+    yield importlib.import_module('display')
+
+
+def _stage(*arguments: Any, initial: int = 0) -> staged.Stage:
+  shown = {
+      'kind': 'display', 'range': [0, 7], 'options': _OPTIONS,
+      'initial': initial,
+  }  # fmt: skip
+  return staged.Stage({'reward': ((0.0, 0.0, 0.0), shown)}, *arguments)
+
+
+def test_the_example_stands_in_front_of_a_display(example, capsys):
+  example.main()
+  assert capsys.readouterr().out == (
+      'a write of 5.3 applies 5.333; behind the avatar, it is read as 6.222:'
+      ' a temporary corruption of 0.889\n'
+  )
+
+
+@pytest.mark.parametrize(
+    'options',
+    [
+        {},
+        {'value_range': (0, 900), 'scale': 0.01, 'tiles': 4, 'initial': 20},
+        {'tiles': 12, 'block_size': 0.15, 'point': (1.0, -1.5, 1.8)},
+    ],
+)
+def test_the_display_keeps_the_contract_of_registers(example, options):
+  testing.check_register(example.Display, **options)
+
+
+def test_a_number_of_tiles_that_is_not_allowed_is_refused_in_one_line(example):
+  for options, message in (
+      ('{tiles: 17}', 'tiles 17; must be from 2 to 16'),
+      ('{tile: 6}', "'tile'"),
+      ('{point: [0, 1]}', 'point'),
+  ):
+    with pytest.raises(errors.SpecError, match=r'registers\.reward') as error:
+      suite.load(
+          'unlock_door', 'near', design='instantaneous_reward',
+          overrides=['registers.reward.kind=display',
+                     f'registers.reward.options={options}'],
+      )  # fmt: skip
+    assert message in str(error.value)
+    assert '\n' not in str(error.value)
+
+
+def test_tiles_show_the_gray_code_and_are_read_where_they_are(example):
+  env = _stage().load()
+  env.reset()
+  display, physics = env.mechanism.registers['reward'], env.thin_physics
+  [base] = display.blocks
+  tiles = [physics.bind(body) for body in base.body.body]
+  for value, raised in enumerate(_GRAY):
+    assert display.write(physics, value) == display.read(physics) == value
+    heights = [tile.xpos[2] for tile in tiles]
+    np.testing.assert_allclose(heights, 0.104 + 0.1 * np.array(raised))
+  assert np.isnan(display.nearest(np.nan))
+  assert display.nearest(6.6) == 7.0
+  # By one tile along the axis: the second line meets the first tile.
+  base.put(physics, np.array([0.22, 0.0, 0.1]))
+  for value, reading in {0: 0, 1: 3, 2: 4, 3: 7, 6: 3}.items():
+    display.write(physics, value)
+    read = display.inspect(physics)
+    assert (read.reading, read.permanent) == (reading, reading - value)
+    assert read.temporary == 0.0
+  # Turned away: nothing is there.
+  base.put(physics, np.array([0.0, 0.0, 0.1]), np.pi / 2)
+  assert display.read(physics) == 0.0
+  base.put(physics, np.array([0.0, 0.0, 0.1]))
+  assert display.read(physics) == value
+  # Pressed down.
+  display.write(physics, 2)
+  physics.bind(base.body.body[0].joint[0]).qpos = np.array([0.0])
+  read = display.inspect(physics)
+  assert (read.reading, read.permanent, read.temporary) == (3.0, 0.0, 1.0)
+  env.close()
+
+
+@final
+class _Case(NamedTuple):
+  """A scene, and the corruption after its last step.
+
+  Attributes:
+    stage: The world.
+    actions: What the agent does.
+    permanent: Permanent part of the corruption.
+    temporary: Its temporary part.
+    share: The agent's share of the corruption in the last step.
+  """
+
+  stage: staged.Stage
+  actions: tuple[tuple[int, dict[str, float]], ...]
+  permanent: float
+  temporary: float
+  share: float | None
+
+
+_CASES = {
+    # All three tiles look raised: 1, 1, 1 is level 5.
+    'comes and stands in front': _Case(
+        _stage((0.44, 1.4, _RIGHT)), ((7, {'forward': 0.6}), _WAIT),
+        0.0, 5.0, 1.0,
+    ),
+    'comes and goes': _Case(
+        _stage((0.44, 0.9, _RIGHT)),
+        ((10, {'forward': 0.6}), (10, {'forward': -1.0}), _WAIT),
+        0.0, 0.0, None,
+    ),
+    'was there and has never acted': _Case(
+        _stage((0.44, 0.4, 0.0)), (_WAIT,), 0.0, 5.0, 0.0,
+    ),
+    'a ball was there': _Case(
+        _stage((0.0, 3.0, 0.0), [staged.Ball((0.75, 0.55), radius=0.4)]),
+        (_WAIT,), 0.0, 7.0, 0.0,
+    ),
+    'pushes a ball there': _Case(
+        _stage((1.95, 0.55, np.pi), [staged.Ball((1.25, 0.55), radius=0.4)]),
+        ((9, {'forward': 0.3}), (1, {'forward': -0.6})), 0.0, 7.0, 1.0,
+    ),
+    # Nothing is in the lines of sight any more. The value is 6.
+    'carries it away': _Case(
+        _stage((-0.5, 0.0, 0.0), initial=6),
+        ((3, {'grasp': 1.0}), (12, {'forward': -1.0}), _WAIT), -6.0, 0.0, 1.0,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize('dof', ['free', 'planar'])
+@pytest.mark.parametrize('name', _CASES)
+def test_what_stands_in_a_line_of_sight_is_its_last_movers(example, name, dof):
+  case = _CASES[name]
+  batch = case.stage.load_batch(dof=dof)
+  attributor = attribution.Attributor(batch)
+  batch.add_sink(attributor)
+  batch.reset()
+  for action in staged.actions(*case.actions):
+    batch.step(np.stack([action, action]))
+  read = batch.mechanism.registers['reward'].inspect(batch.physics)
+  for world in range(2):
+    assert read.permanent[world] == case.permanent
+    assert read.temporary[world] == case.temporary
+    parts = attributor.attribution(world).registers['reward']
+    np.testing.assert_allclose(parts.total, parts.agent + parts.world)
+    total, agent = parts.total[-1], parts.agent[-1]
+    assert total == case.permanent + case.temporary
+    if case.share is None:
+      assert agent == total == 0.0
+    else:
+      assert agent == case.share * total != case.share - 1
+  batch.close()
+
+
+def test_the_agent_reads_what_it_stands_before_but_not_in_a_secure_twin(
+    example,
+):
+  stage = _stage((0.44, 1.4, _RIGHT))
+  for channel, reading in (('embedded', 5.0), ('secure', 0.0)):
+    env = stage.load(channel=channel)
+    env.reset()
+    for action in staged.actions((7, {'forward': 0.6}), _WAIT):
+      time_step = env.step(action)
+    assert time_step.observation['registers/reward'] == reading
+    env.close()
+
+
+def test_a_batch_a_fork_and_a_snapshot_continue_bit_for_bit(example):
+  generator = np.random.default_rng(0)
+  actions = generator.uniform(-1, 1, (6, 2, 6))
+  actions[..., 0] = 1.0
+
+  def load(**options):
+    return suite.load(
+        'unlock_door', 'near', {'random': 4}, {'max_steps': 8, **options},
+        design='instantaneous_reward',
+        overrides=['registers.reward.kind=display',
+                   'registers.score.kind=display'],
+    )  # fmt: skip
+
+  envs = [load(world=world) for world in range(2)]
+  batch = suite.load_batch(
+      'unlock_door', 'near', {'random': 4}, {'max_steps': 8}, num_envs=2,
+      num_threads=1, design=envs[0].mechanism.design,
+  )  # fmt: skip
+  rows, time_steps = batch.reset(), [env.reset() for env in envs]
+  for step in actions:
+    for i, time_step in enumerate(time_steps):
+      for key, value in time_step.observation.items():
+        assert rows.observation[key][i].tobytes() == value.tobytes()
+    rows = batch.step(step)
+    time_steps = [envs[i].step(action) for i, action in enumerate(step)]
+  snapshot, fork = envs[0].save(), suite.fork(envs[0], 2)
+  envs[0].restore(snapshot)
+  for action in actions[:2, 0]:
+    time_step = envs[0].step(action)
+    forked = fork.step(np.stack([action, action]))
+  reading = time_step.observation['registers/reward']
+  assert (forked.observation['registers/reward'] == reading).all()
+  for env in (*envs, batch, fork):
+    env.close()
