@@ -64,8 +64,8 @@ def attacked(design: specs.DesignSpec, target: str | None = None) -> list[str]:
   """Returns the names of the registers to attack, in the order of the attacks.
 
   Those that the learner consumes come first, then signals that end episodes,
-  meters, queries, memories and others. Welded and secure registers are left
-  out, because nothing can move them.
+  meters, queries, memories and others. Secure registers are left out, because
+  nothing can move them.
 
   Args:
     design: Design of the agent.
@@ -105,7 +105,7 @@ def attacked(design: specs.DesignSpec, target: str | None = None) -> list[str]:
 
 
 def targets(env: environment.Environment, names: Sequence[str]) -> list[Target]:
-  """Returns all blocks of registers that can be moved by themselves.
+  """Returns all blocks of registers.
 
   Args:
     env: Environment. An episode must have begun.
@@ -129,8 +129,6 @@ def _targets_of(
   kinds = appearance.class_of_geoms(physics.model)
   found = []
   for i, block in enumerate(register.blocks):
-    if not isinstance(block, block_kinds.JointedBlock):
-      continue  # It moves with another one, as the tiles of a display do.
     geom = physics.bind(block.geom)
     rotation = np.reshape(geom.xmat, (3, 3))
     # Angle of the register's x axis to that of the world.

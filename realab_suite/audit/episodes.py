@@ -10,7 +10,6 @@ from realab_suite.audit import aiming
 from realab_suite.engine import batch_environment
 from realab_suite.engine import batch_time_steps
 from realab_suite.engine import events
-from realab_suite.entities import block_kinds
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import results
@@ -166,9 +165,7 @@ class Watch(events.BatchEventSink):
         metres = np.minimum(metres, moved)
       farthest = self.metres[:, i]
       np.maximum(farthest, metres, out=farthest, where=counts)
-      block = self._blocks[i]
-      if isinstance(block, block_kinds.JointedBlock):
-        for grasp in block.grasps:
-          active = physics.bind(grasp.constraints).active
-          self.held[:, i] += counts & np.any(active, axis=-1)
+      for grasp in self._blocks[i].grasps:
+        active = physics.bind(grasp.constraints).active
+        self.held[:, i] += counts & np.any(active, axis=-1)
     self._has_ended[list(step.ends)] = True

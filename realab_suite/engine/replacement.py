@@ -18,7 +18,6 @@ import mujoco
 import numpy as np
 
 from realab_suite.engine import solids
-from realab_suite.entities import block_kinds
 from realab_suite.entities import registers
 from realab_suite.entities import surroundings
 from realab_suite.feedback import mechanisms
@@ -122,8 +121,7 @@ def _move(
   if shift.any():
     register.settle(physics, displacement)
   for block in register.blocks:
-    if isinstance(block, block_kinds.JointedBlock):
-      block.surroundings.shift(displacement)
+    block.surroundings.shift(displacement)
 
 
 @contextlib.contextmanager

@@ -49,7 +49,7 @@ class Place:
   yaw: float = 0.0
   spread: tuple[float, float] = (0.0, 0.0)
   height: float = 0.0
-  block: block_kinds.JointedBlock | None = None
+  block: block_kinds.Block | None = None
 
   def __post_init__(self) -> None:
     """Checks the numbers.

@@ -171,7 +171,7 @@ class Avatar(measurables.MeasurableEntity):
         self._rays,
         self._body.add('site', name='rays', pos=(0, 0, RAY_HEIGHT), group=4),
     )
-    self._blocks: list[block_kinds.JointedBlock] = []
+    self._blocks: list[block_kinds.Block] = []
     self._grasps: list[grasps.Grasp] = []
     self._constraints: tuple[mjcf.Element, ...] = ()
     self._pairs: list[mjcf.Element] = []
@@ -286,7 +286,7 @@ class Avatar(measurables.MeasurableEntity):
     return {name: value for name, value in senses.items() if name in names}
 
   def make_graspable(self, blocks: Sequence[block_kinds.Block]) -> None:
-    """Makes blocks graspable by the hand; ignores those without joints.
+    """Makes blocks graspable by the hand.
 
     Contacts of the body with large blocks become softer.
 
@@ -307,8 +307,6 @@ class Avatar(measurables.MeasurableEntity):
             friction=(slip, slip, spin, roll, roll),
         )  # fmt: skip
         self._pairs.append(pair)
-      if not isinstance(block, block_kinds.JointedBlock):
-        continue
       grasp = grasps.Grasp(self._hand, block.site, self._hand_position)
       block.grasps.append(grasp)
       self._grasps.append(grasp)
@@ -316,7 +314,7 @@ class Avatar(measurables.MeasurableEntity):
     self._constraints = grasps.constraints_of(self._grasps)
 
   @property
-  def graspable(self) -> Sequence[block_kinds.JointedBlock]:
+  def graspable(self) -> Sequence[block_kinds.Block]:
     """Blocks that the hand can grasp, in the order in which they were added."""
     return tuple(self._blocks)
 

@@ -86,117 +86,7 @@ def find_misfit(block: 'Block', timestep: float) -> Misfit | None:
 
 
 class Block(abc.ABC):
-  """Base class for the blocks of registers."""
-
-  def __init__(self, half_size: float) -> None:
-    self._half_size = half_size
-    self._grasps: list[grasps.Grasp] = []
-
-  @property
-  def grasps(self) -> list[grasps.Grasp]:
-    """Grasps by which hands can hold the block."""
-    return self._grasps
-
-  @property
-  def half_size(self) -> float:
-    """Half the edge length, in m."""
-    return self._half_size
-
-  @property
-  @abc.abstractmethod
-  def body(self) -> mjcf.Element:
-    """Body of the cube."""
-
-  @property
-  @abc.abstractmethod
-  def geom(self) -> mjcf.Element:
-    """Geom of the cube."""
-
-  @property
-  @abc.abstractmethod
-  def rest_height(self) -> float:
-    """Height of the centre of a block that rests on the floor, in m."""
-
-  @abc.abstractmethod
-  def position(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns the centre in the register's frame, `(..., 3)`, in m."""
-
-  def along(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns the x coordinate in the register's frame, `(...)`, in m."""
-    return self.position(physics).T[0]
-
-  @abc.abstractmethod
-  def heading(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns the angle about the vertical, `(...)`, in (-pi, pi]."""
-
-  def orientation(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns the orientation as a quaternion, `(..., 4)`."""
-    return rotations.quaternion_of(self.heading(physics))
-
-  def slide(
-      self,
-      physics: protocols.Physics,
-      along: np.ndarray,
-      where: axes.Mask = None,
-  ) -> np.ndarray:
-    """Sets the x coordinate in the register's frame, and nothing else.
-
-    The block keeps its other coordinates, its orientation and its velocity, and
-    a hand that holds it keeps hold. If the block would be inside an immovable
-    object, it gets the nearest free coordinate.
-
-    Args:
-      physics: One world or a batch of worlds.
-      along: Coordinate, `(...)`, in m.
-      where: As in `put`.
-
-    Returns:
-      Coordinate that the block got, `(...)`, in m; `along` itself if nothing
-      was in the way.
-
-    Raises:
-      TypeError: If the block has no joints; nothing but `put` moves it.
-    """
-    raise TypeError(f'{type(self).__name__} has no joints')
-
-  def turn(
-      self,
-      physics: protocols.Physics,
-      heading: np.ndarray,
-      where: axes.Mask = None,
-  ) -> None:
-    """Sets the angle about the vertical, and nothing else.
-
-    Args:
-      physics: One world or a batch of worlds.
-      heading: Angle about the vertical, `(...)`, in rad.
-      where: As in `put`.
-
-    Raises:
-      TypeError: If the block has no joints; nothing but `put` moves it.
-    """
-    raise TypeError(f'{type(self).__name__} has no joints')
-
-  @abc.abstractmethod
-  def put(
-      self,
-      physics: protocols.Physics,
-      position: Any,
-      heading: Any = None,
-      where: axes.Mask = None,
-  ) -> None:
-    """Teleports the block to a pose, upright and at rest, and releases it.
-
-    Args:
-      physics: One world or a batch of worlds.
-      position: Centre in the register's frame, `(..., 3)`, in m.
-      heading: Angle about the vertical, `(...)`, in rad; `None` for 0.
-      where: Worlds in which to do so, `(...)` bool; `None` for all worlds.
-    """
-
-
-class JointedBlock(Block):
-  """Base class for blocks with joints of their own in the register's model.
+  """Base class for the blocks of registers, whose joints belong to its model.
 
   A free joint would be simpler, but MuJoCo accepts free joints only on children
   of the world, and a register must remain one subtree that can be attached to
@@ -226,7 +116,8 @@ class JointedBlock(Block):
       mass: Mass, in kg.
       style: Geom attributes; see `appearance.geom_style`.
     """
-    super().__init__(half_size)
+    self._half_size = half_size
+    self._grasps: list[grasps.Grasp] = []
     self._rest = np.array([*position, self.rest_height])
     self._body = mjcf_model.worldbody.add('body', name=name, pos=self._rest)
     self._geom = self._body.add(
@@ -243,16 +134,23 @@ class JointedBlock(Block):
     self._written_slot = state.Slot(mjcf_model, f'{name}_written')
 
   @property
-  @abc.abstractmethod
-  def _grip_offset(self) -> float:
-    """Height of the grip above the centre of the block, in m."""
+  def grasps(self) -> list[grasps.Grasp]:
+    """Grasps by which hands can hold the block."""
+    return self._grasps
+
+  @property
+  def half_size(self) -> float:
+    """Half the edge length, in m."""
+    return self._half_size
 
   @property
   def body(self) -> mjcf.Element:
+    """Body of the cube."""
     return self._body
 
   @property
   def geom(self) -> mjcf.Element:
+    """Geom of the cube."""
     return self._geom
 
   @property
@@ -273,8 +171,31 @@ class JointedBlock(Block):
     """
     return self._written_slot
 
+  @property
+  @abc.abstractmethod
+  def rest_height(self) -> float:
+    """Height of the centre of a block that rests on the floor, in m."""
+
+  @property
+  @abc.abstractmethod
+  def _grip_offset(self) -> float:
+    """Height of the grip above the centre of the block, in m."""
+
+  @abc.abstractmethod
+  def position(self, physics: protocols.Physics) -> np.ndarray:
+    """Returns the centre in the register's frame, `(..., 3)`, in m."""
+
   def along(self, physics: protocols.Physics) -> np.ndarray:
+    """Returns the x coordinate in the register's frame, `(...)`, in m."""
     return self._rest[0] + physics.bind(self._slides).qpos.T[0]
+
+  @abc.abstractmethod
+  def heading(self, physics: protocols.Physics) -> np.ndarray:
+    """Returns the angle about the vertical, `(...)`, in (-pi, pi]."""
+
+  def orientation(self, physics: protocols.Physics) -> np.ndarray:
+    """Returns the orientation as a quaternion, `(..., 4)`."""
+    return rotations.quaternion_of(self.heading(physics))
 
   def slide(
       self,
@@ -282,6 +203,21 @@ class JointedBlock(Block):
       along: np.ndarray,
       where: axes.Mask = None,
   ) -> np.ndarray:
+    """Sets the x coordinate in the register's frame, and nothing else.
+
+    The block keeps its other coordinates, its orientation and its velocity, and
+    a hand that holds it keeps hold. If the block would be inside an immovable
+    object, it gets the nearest free coordinate.
+
+    Args:
+      physics: One world or a batch of worlds.
+      along: Coordinate, `(...)`, in m.
+      where: As in `put`.
+
+    Returns:
+      Coordinate that the block got, `(...)`, in m; `along` itself if nothing
+      was in the way.
+    """
     position = self.position(physics)
     is_far = self._surroundings.are_far(physics, position)
     if not axes.everywhere(is_far):
@@ -291,6 +227,38 @@ class JointedBlock(Block):
     axes.assign(physics.bind(self._slides[0]), 'qpos', moved, where)
     self._adapt_grasps(physics, position, where)
     return along
+
+  @abc.abstractmethod
+  def turn(
+      self,
+      physics: protocols.Physics,
+      heading: np.ndarray,
+      where: axes.Mask = None,
+  ) -> None:
+    """Sets the angle about the vertical, and nothing else.
+
+    Args:
+      physics: One world or a batch of worlds.
+      heading: Angle about the vertical, `(...)`, in rad.
+      where: As in `put`.
+    """
+
+  @abc.abstractmethod
+  def put(
+      self,
+      physics: protocols.Physics,
+      position: Any,
+      heading: Any = None,
+      where: axes.Mask = None,
+  ) -> None:
+    """Teleports the block to a pose, upright and at rest, and releases it.
+
+    Args:
+      physics: One world or a batch of worlds.
+      position: Centre in the register's frame, `(..., 3)`, in m.
+      heading: Angle about the vertical, `(...)`, in rad; `None` for 0.
+      where: Worlds in which to do so, `(...)` bool; `None` for all worlds.
+    """
 
   def _free(
       self,
@@ -391,7 +359,7 @@ class JointedBlock(Block):
 
 
 @final
-class FreeBlock(JointedBlock):
+class FreeBlock(Block):
   """A block that can be pushed, lifted, carried, thrown and toppled."""
 
   def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -450,7 +418,7 @@ class FreeBlock(JointedBlock):
 
 
 @final
-class PlanarBlock(JointedBlock):
+class PlanarBlock(Block):
   """A block that slides and turns along the floor and is never lifted.
 
   It is cheaper to simulate than a free block.

@@ -62,13 +62,13 @@ class Crate(measurables.MeasurableEntity):
     self._mjcf_root = mjcf.RootElement(model=name)
     block_kind = block_kinds.PlanarBlock if is_planar else block_kinds.FreeBlock
     style = appearance.geom_style(kind)
-    self._block: block_kinds.JointedBlock = block_kind(
+    self._block: block_kinds.Block = block_kind(
         self._mjcf_root, 'block', (0.0, 0.0), size / 2, mass, style
     )
     self._place = arenas.Place((0.0, 0.0))
 
   @property
-  def block(self) -> block_kinds.JointedBlock:
+  def block(self) -> block_kinds.Block:
     """Cube of the crate."""
     return self._block
 

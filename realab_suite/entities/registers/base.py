@@ -118,7 +118,7 @@ class Register(modelled.ModelledEntity):
     self._clean_slot = state.Slot(self._mjcf_root, 'clean', size)
     self._origin_slot = state.Slot(self._mjcf_root, 'origin', 3)
     self._blocks = self._build_blocks()
-    self._borrowed: block_kinds.JointedBlock | None = None
+    self._borrowed: block_kinds.Block | None = None
     self._measure_initial: Callable[[Any], np.ndarray] | None = None
 
   def _build_observables(self) -> RegisterObservables:
@@ -338,7 +338,7 @@ class Register(modelled.ModelledEntity):
       position: Sequence[float],
       yaw: float = 0.0,
       spread: Sequence[float] = (0.0, 0.0),
-      block: block_kinds.JointedBlock | None = None,
+      block: block_kinds.Block | None = None,
   ) -> None:
     """Attaches the register to the root entity of a task.
 
@@ -368,10 +368,9 @@ class Register(modelled.ModelledEntity):
       frame.quat = [np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]
     reach = np.array([self._low, self._high]) * self._scale
     for own in self._blocks:
-      if isinstance(own, block_kinds.JointedBlock):
-        own.surroundings.limit(
-            reach[0] - spread[0], reach[1] + spread[0], spread[1]
-        )
+      own.surroundings.limit(
+          reach[0] - spread[0], reach[1] + spread[0], spread[1]
+      )
       if isinstance(own, block_kinds.PlanarBlock):
         own.stand_at(height)
     if block is not None:
@@ -397,9 +396,7 @@ class Register(modelled.ModelledEntity):
         ' two_block, and other places'
     )
 
-  def _use_block(
-      self, root: composer.Entity, block: block_kinds.JointedBlock
-  ) -> None:
+  def _use_block(self, root: composer.Entity, block: block_kinds.Block) -> None:
     """Replaces the base block by a block of the world, in `blocks` as well.
 
     Kinds with a base block may override this method. The register is attached.
@@ -734,7 +731,7 @@ class Register(modelled.ModelledEntity):
 
   def _add_block(
       self, name: str, class_name: str, position: Sequence[float]
-  ) -> block_kinds.JointedBlock:
+  ) -> block_kinds.Block:
     """Adds a block with the register's degrees of freedom.
 
     Args:

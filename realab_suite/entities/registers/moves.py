@@ -19,7 +19,7 @@ def slide(
 
   Args:
     physics: One world or a batch of worlds.
-    block: Block with joints.
+    block: The block.
     start: Coordinate that represents 0, `(...)`, in m.
     value: Value to represent, `(...)`.
     scale: Length per unit of value, in m.
@@ -62,7 +62,7 @@ def turn(
 
   Args:
     physics: One world or a batch of worlds.
-    block: Block with joints.
+    block: The block.
     heading: Angle about the vertical, `(...)`, in rad.
     where: As in `slide`.
   """

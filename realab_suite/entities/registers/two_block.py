@@ -46,9 +46,7 @@ class TwoBlockRegister(base.Register):
     )
     return [self._base, self._offset]
 
-  def _use_block(
-      self, root: composer.Entity, block: block_kinds.JointedBlock
-  ) -> None:
+  def _use_block(self, root: composer.Entity, block: block_kinds.Block) -> None:
     self._exclusion.remove()
     self._mjcf_root.find('body', 'base').remove()
     self._base = self._blocks[0] = block
