@@ -77,11 +77,15 @@ class Display(registers.Register):
     places = (2 * half + _GAP) * np.arange(1, len(self._weights) + 1)
     self._end, contacts = places[-1], block_contacts.attributes(half)
     base.body.add(
-        'geom', name='plank', type='box', mass=base.geom.mass, **contacts,
+        'geom',
+        name='plank',
+        type='box',
+        mass=base.geom.mass,
+        **contacts,
         pos=(self._end / 2, 0, _PLANK / 2 - half),
         size=(self._end / 2 + half, half, _PLANK / 2),
         **appearance.geom_style(block_kinds.BASE_BLOCK, colours[0]),
-    )  # fmt: skip
+    )
     self._lifts = []
     for i, x in enumerate(places, start=1):
       tile = base.body.add(
@@ -89,14 +93,24 @@ class Display(registers.Register):
       )
       # What lies on a tile presses it down slowly.
       lift = tile.add(
-          'joint', name=f'lift_{i}', type='slide', axis=(0, 0, 1),
-          damping=50.0, armature=10.0, limited='true', range=(0, half),
-      )  # fmt: skip
+          'joint',
+          name=f'lift_{i}',
+          type='slide',
+          axis=(0, 0, 1),
+          damping=50.0,
+          armature=10.0,
+          limited='true',
+          range=(0, half),
+      )
       tile.add(
-          'geom', name=f'tile_{i}', type='box', size=[half] * 3, **contacts,
+          'geom',
+          name=f'tile_{i}',
+          type='box',
+          size=[half] * 3,
+          **contacts,
           mass=base.geom.mass / 10,
           **appearance.geom_style(block_kinds.OFFSET_BLOCK, colours[1]),
-      )  # fmt: skip
+      )
       self._lifts.append(lift)
     self._geoms = self.mjcf_model.find_all('geom')
     self._site = self.mjcf_model.worldbody.add('site', name='point', group=4)
@@ -181,9 +195,12 @@ class Display(registers.Register):
 def main() -> None:
   """Pays an agent by a display, and stands in front of it."""
   env = suite.load(
-      'unlock_door', 'near', {'random': 1}, design='instantaneous_reward',
+      'unlock_door',
+      'near',
+      {'random': 1},
+      design='instantaneous_reward',
       overrides=['registers.reward.kind=display'],
-  )  # fmt: skip
+  )
   env.reset()
   display, physics = env.mechanism.registers['reward'], env.thin_physics
   applied = display.write(physics, 5.3)

@@ -198,15 +198,13 @@ def _kind(name: str) -> list[str]:
   blocks = [
       (
           f'`{block.geom.name}`',
-          'none' if direction is None else _at(direction),
+          'none' if block.direction is None else _at(block.direction),
           *(
               _tried(register, physics, block, *deed)
               for deed in _DEEDS.values()
           ),
       )
-      for block, direction in zip(
-          register.blocks, register.directions, strict=True
-      )
+      for block in register.blocks
   ]
   header = ('block', 'direction that raises the reading', *_DEEDS)
   parts = [

@@ -1,7 +1,7 @@
 """Blocks that audits and saboteurs attack, and the directions of the attacks.
 
-Registers declare in `Register.directions` which motion of each block raises
-their reading, so that registers of any kind can be attacked.
+Blocks declare in `direction` which motion raises the reading of their register,
+so that registers of any kind can be attacked.
 """
 
 from collections.abc import Sequence
@@ -121,11 +121,6 @@ def targets(env: environment.Environment, names: Sequence[str]) -> list[Target]:
 def _targets_of(
     register: registers.Register, physics: protocols.Physics
 ) -> list[Target]:
-  if len(register.directions) != len(register.blocks):
-    raise errors.SpecError(
-        f'register {register.name!r}: directions {register.directions};'
-        f' allowed is one for each of its {len(register.blocks)} blocks'
-    )
   kinds = appearance.class_of_geoms(physics.model)
   found = []
   for i, block in enumerate(register.blocks):
@@ -133,12 +128,11 @@ def _targets_of(
     rotation = np.reshape(geom.xmat, (3, 3))
     # Angle of the register's x axis to that of the world.
     frame = np.arctan2(rotation[1, 0], rotation[0, 0]) - block.heading(physics)
-    direction = register.directions[i]
-    x, y = (1.0, 0.0) if direction is None else direction
+    x, y = block.direction or (1.0, 0.0)
     height, half = float(np.ravel(geom.xpos)[2]), block.half_size
     is_seen = abs(height - avatars.RAY_HEIGHT) < half - _MARGIN
     code = int(kinds[np.ravel(geom.element_id)[0]])
-    turns = (0.0, 0.5, 1.0, 1.5) if direction is None else (0.0, 1.0)
+    turns = (0.0, 1.0) if block.direction else (0.0, 0.5, 1.0, 1.5)
     angles = [frame + np.arctan2(y, x) + turn * np.pi for turn in turns]
     found.append(
         Target(

@@ -105,6 +105,8 @@ class Block(abc.ABC):
       half_size: float,
       mass: float,
       style: dict[str, Any],
+      direction: tuple[float, float] | None = None,
+      ports: Sequence[str] = (),
   ) -> None:
     """Adds the block to the model of a register.
 
@@ -115,8 +117,12 @@ class Block(abc.ABC):
       half_size: Half the edge length, in m.
       mass: Mass, in kg.
       style: Geom attributes; see `appearance.geom_style`.
+      direction: As the property of that name.
+      ports: As the property of that name.
     """
     self._half_size = half_size
+    self._direction = direction
+    self._ports = tuple(ports)
     self._grasps: list[grasps.Grasp] = []
     self._rest = np.array([*position, self.rest_height])
     self._body = mjcf_model.worldbody.add('body', name=name, pos=self._rest)
@@ -142,6 +148,22 @@ class Block(abc.ABC):
   def half_size(self) -> float:
     """Half the edge length, in m."""
     return self._half_size
+
+  @property
+  def direction(self) -> tuple[float, float] | None:
+    """Direction of the motion that raises the reading of the register.
+
+    It is `(x, y)` of length 1 in the register's frame, or `None` for a block
+    with no such direction, for example one that has to be turned. Audits and
+    saboteurs move the block in this direction and against it, or else in four
+    directions.
+    """
+    return self._direction
+
+  @property
+  def ports(self) -> tuple[str, ...]:
+    """Ports of the register that depend on the block; none stands for all."""
+    return self._ports
 
   @property
   def body(self) -> mjcf.Element:

@@ -63,7 +63,13 @@ class Crate(measurables.MeasurableEntity):
     block_kind = block_kinds.PlanarBlock if is_planar else block_kinds.FreeBlock
     style = appearance.geom_style(kind)
     self._block: block_kinds.Block = block_kind(
-        self._mjcf_root, 'block', (0.0, 0.0), size / 2, mass, style
+        self._mjcf_root,
+        'block',
+        (0.0, 0.0),
+        size / 2,
+        mass,
+        style,
+        direction=(-1.0, 0.0),  # That of a base block.
     )
     self._place = arenas.Place((0.0, 0.0))
 

@@ -62,7 +62,7 @@ def check_register(
   - A write removes temporary corruption, and keeps permanent corruption.
   - A block that is moved in any direction is a displacement, and some motion of
     some block changes each reading. A port depends on its own blocks only, and
-    `directions` raise a reading.
+    the `direction` of a block raises a reading.
   - Nothing that happens to blocks changes the reading of a secure register.
   - Writes put blocks nowhere but on the paths of the footprint, with the
     headings of these paths.
@@ -365,18 +365,10 @@ def _check_displacements(subject: _Subject) -> None:
   """Checks the consequences of the motion of a single block."""
   register, physics = subject.register, subject.physics
   where = subject.where
-  contracts.require(
-      len(register.directions) == len(register.blocks),
-      f'{where}: {len(register.directions)} directions for'
-      f' {len(register.blocks)} blocks',
-  )
   changed = np.zeros(register.value_spec.shape, bool)
-  for i, (block, direction) in enumerate(
-      zip(register.blocks, register.directions, strict=True)
-  ):
-    depends = np.array(
-        [block in register.blocks_of(port) for port in register.PORTS] or True
-    )
+  for i, block in enumerate(register.blocks):
+    direction, named = block.direction, block.ports or register.PORTS
+    depends = np.array([port in named for port in register.PORTS] or True)
     # A register of few levels may not notice less than the size of a block.
     size = 2 * block.half_size
     for x, y in (*_DIRECTIONS, *([direction] if direction else [])):
@@ -391,14 +383,15 @@ def _check_displacements(subject: _Subject) -> None:
       )
       contracts.require(
           _are_close(difference[~depends], 0.0),
-          f'{where}: block {i} changes ports that do not name it in blocks_of',
+          f'{where}: block {i} changes other ports than {named}',
       )
       changed |= np.abs(difference) > _ROUNDING
     if direction:
       contracts.require(
           difference.max() > _ROUNDING,
           f'{where}: block {i} was moved in its direction {direction}, and the'
-          f' reading changed by {difference}; directions raise a reading',
+          f' reading changed by {difference}; the direction of a block'
+          ' raises a reading',
       )
     changed |= np.abs(_displaced(subject, block, turn=0.1)) > _ROUNDING
   fixed = [p for i, p in enumerate(register.PORTS) if not changed[i]]

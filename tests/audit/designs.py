@@ -40,10 +40,12 @@ class ThreeBlocks(registers.Register):
   Only a kind says in which direction its blocks raise the reading.
   """
 
+  _DOWN, _UP = None, None
+
   def _build_blocks(self):
-    self._base = self._add_block('base', 'base_block', (0.0, 0.0))
+    self._base = self._add_block('base', 'base_block', (0.0, 0.0), self._DOWN)
     self._others = [
-        self._add_block(name, 'offset_block', (0.0, y))
+        self._add_block(name, 'offset_block', (0.0, y), self._UP)
         for name, y in zip(('near', 'far'), _ASIDE, strict=True)
     ]
     return [self._base, *self._others]
@@ -85,9 +87,7 @@ class ThreeBlocks(registers.Register):
 class DirectedBlocks(ThreeBlocks):
   """Three blocks that say in which direction they raise the reading."""
 
-  @property
-  def directions(self):
-    return (-1.0, 0.0), (1.0, 0.0), (1.0, 0.0)
+  _DOWN, _UP = (-1.0, 0.0), (1.0, 0.0)
 
 
 @register_kinds.REGISTER_KINDS.add('three_silent_blocks')

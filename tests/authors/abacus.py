@@ -24,10 +24,10 @@ class Abacus(registers.Register):
   PORTS = 'left', 'right'
 
   def _build_blocks(self):
-    base = self._add_block('base', 'base_block', (0.0, 0.0))
+    base = self._add_block('base', 'base_block', (0.0, 0.0), (-1.0, 0.0))
     self._starts = [(0.0, 0.25, 0.0), (0.0, -0.25, 0.0)]
     self._beads = [
-        self._add_block(port, 'offset_block', start[:2])
+        self._add_block(port, 'offset_block', start[:2], (1.0, 0.0), [port])
         for port, start in zip(self.PORTS, self._starts, strict=True)
     ]
     return [base, *self._beads]
@@ -63,13 +63,6 @@ class Abacus(registers.Register):
   def _permanent(self, physics):
     moved = self._origin(physics)[..., 0] - self.blocks[0].along(physics)
     return np.stack([moved, moved], axis=-1) / self._scale
-
-  def blocks_of(self, port):
-    return [self.blocks[0], self._beads[self.PORTS.index(port)]]
-
-  @property
-  def directions(self):
-    return (-1.0, 0.0), (1.0, 0.0), (1.0, 0.0)
 
 
 @providers.PROVIDERS.add('copies_of_two')

@@ -25,9 +25,15 @@ _RIGHT = -np.pi / 2
 _WAIT = (4, {})
 # Tiles of each level: raised (1) or lowered (0).
 _GRAY = (
-    (0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0),
-    (0, 1, 1), (1, 1, 1), (1, 0, 1), (0, 0, 1),
-)  # fmt: skip
+    (0, 0, 0),
+    (1, 0, 0),
+    (1, 1, 0),
+    (0, 1, 0),
+    (0, 1, 1),
+    (1, 1, 1),
+    (1, 0, 1),
+    (0, 0, 1),
+)
 
 
 @pytest.fixture(name='example')
@@ -40,9 +46,11 @@ def fixture_example(monkeypatch):
 
 def _stage(*arguments: Any, initial: int = 0) -> staged.Stage:
   shown = {
-      'kind': 'display', 'range': [0, 7], 'options': _OPTIONS,
+      'kind': 'display',
+      'range': [0, 7],
+      'options': _OPTIONS,
       'initial': initial,
-  }  # fmt: skip
+  }
   return staged.Stage({'reward': ((0.0, 0.0, 0.0), shown)}, *arguments)
 
 
@@ -74,10 +82,14 @@ def test_a_number_of_tiles_that_is_not_allowed_is_refused_in_one_line(example):
   ):
     with pytest.raises(errors.SpecError, match=r'registers\.reward') as error:
       suite.load(
-          'unlock_door', 'near', design='instantaneous_reward',
-          overrides=['registers.reward.kind=display',
-                     f'registers.reward.options={options}'],
-      )  # fmt: skip
+          'unlock_door',
+          'near',
+          design='instantaneous_reward',
+          overrides=[
+              'registers.reward.kind=display',
+              f'registers.reward.options={options}',
+          ],
+      )
     assert message in str(error.value)
     assert '\n' not in str(error.value)
 
@@ -136,31 +148,49 @@ class _Case(NamedTuple):
 _CASES = {
     # All three tiles look raised: 1, 1, 1 is level 5.
     'comes and stands in front': _Case(
-        _stage((0.44, 1.4, _RIGHT)), ((7, {'forward': 0.6}), _WAIT),
-        0.0, 5.0, 1.0,
+        _stage((0.44, 1.4, _RIGHT)),
+        ((7, {'forward': 0.6}), _WAIT),
+        0.0,
+        5.0,
+        1.0,
     ),
     'comes and goes': _Case(
         _stage((0.44, 0.9, _RIGHT)),
         ((10, {'forward': 0.6}), (10, {'forward': -1.0}), _WAIT),
-        0.0, 0.0, None,
+        0.0,
+        0.0,
+        None,
     ),
     'was there and has never acted': _Case(
-        _stage((0.44, 0.4, 0.0)), (_WAIT,), 0.0, 5.0, 0.0,
+        _stage((0.44, 0.4, 0.0)),
+        (_WAIT,),
+        0.0,
+        5.0,
+        0.0,
     ),
     'a ball was there': _Case(
         _stage((0.0, 3.0, 0.0), [staged.Ball((0.75, 0.55), radius=0.4)]),
-        (_WAIT,), 0.0, 7.0, 0.0,
+        (_WAIT,),
+        0.0,
+        7.0,
+        0.0,
     ),
     'pushes a ball there': _Case(
         _stage((1.95, 0.55, np.pi), [staged.Ball((1.25, 0.55), radius=0.4)]),
-        ((9, {'forward': 0.3}), (1, {'forward': -0.6})), 0.0, 7.0, 1.0,
+        ((9, {'forward': 0.3}), (1, {'forward': -0.6})),
+        0.0,
+        7.0,
+        1.0,
     ),
     # Nothing is in the lines of sight any more. The value is 6.
     'carries it away': _Case(
         _stage((-0.5, 0.0, 0.0), initial=6),
-        ((3, {'grasp': 1.0}), (12, {'forward': -1.0}), _WAIT), -6.0, 0.0, 1.0,
+        ((3, {'grasp': 1.0}), (12, {'forward': -1.0}), _WAIT),
+        -6.0,
+        0.0,
+        1.0,
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize('dof', ['free', 'planar'])
@@ -208,17 +238,27 @@ def test_a_batch_a_fork_and_a_snapshot_continue_bit_for_bit(example):
 
   def load(**options):
     return suite.load(
-        'unlock_door', 'near', {'random': 4}, {'max_steps': 8, **options},
+        'unlock_door',
+        'near',
+        {'random': 4},
+        {'max_steps': 8, **options},
         design='instantaneous_reward',
-        overrides=['registers.reward.kind=display',
-                   'registers.score.kind=display'],
-    )  # fmt: skip
+        overrides=[
+            'registers.reward.kind=display',
+            'registers.score.kind=display',
+        ],
+    )
 
   envs = [load(world=world) for world in range(2)]
   batch = suite.load_batch(
-      'unlock_door', 'near', {'random': 4}, {'max_steps': 8}, num_envs=2,
-      num_threads=1, design=envs[0].mechanism.design,
-  )  # fmt: skip
+      'unlock_door',
+      'near',
+      {'random': 4},
+      {'max_steps': 8},
+      num_envs=2,
+      num_threads=1,
+      design=envs[0].mechanism.design,
+  )
   rows, time_steps = batch.reset(), [env.reset() for env in envs]
   for step in actions:
     for i, time_step in enumerate(time_steps):

@@ -40,9 +40,11 @@ def test_kinds_keep_the_contract(name: str):
 class _Counting(registers.Register):
   """A register of one block along its axis, written as simply as possible."""
 
+  _TO = None
+
   def _build_blocks(self):
     self.count = 0
-    return [self._add_block('block', 'offset_block', (0.0, 0.0))]
+    return [self._add_block('block', 'offset_block', (0.0, 0.0), self._TO)]
 
   def _places(self, physics, value):
     place = np.array(self._origin(physics))
@@ -144,11 +146,8 @@ _BREACHES: dict[str, tuple[dict[str, Any], str]] = {
         {'_put': _turns, 'footprint': _path_with(0.1, 0.09)},
         'not among the headings of its footprint',
     ),
-    'has directions that lower it': (
-        {"directions": ((-1.0, 0.0),)}, 'directions raise a reading'
-    ),
-    'has too many directions': (
-        {'directions': (None, None)}, '2 directions for 1 blocks'
+    'has a direction that lowers it': (
+        {'_TO': (-1.0, 0.0)}, 'the direction of a block raises a reading'
     ),
     'rounds what is rounded': (
         {'nearest': _halved}, 'write(-1.0) returned -0.5'

@@ -37,11 +37,19 @@ class Abacus(base.Register):
     """Place of each rod beside the base block, in widths; not 0."""
 
   def _build_blocks(self) -> list[block_kinds.Block]:
-    frame = self._add_block('base', block_kinds.BASE_BLOCK, (0.0, 0.0))
+    frame = self._add_block(
+        'base', block_kinds.BASE_BLOCK, (0.0, 0.0), (-1.0, 0.0)
+    )
     width = self._block_size + _GAP
     self._rods = [np.array([0.0, rod * width, 0.0]) for rod in self.rods]
     self._beads = [
-        self._add_block(port, block_kinds.OFFSET_BLOCK, rod[:2].tolist())
+        self._add_block(
+            port,
+            block_kinds.OFFSET_BLOCK,
+            rod[:2].tolist(),
+            (1.0, 0.0),
+            [port],
+        )
         for port, rod in zip(self.PORTS, self._rods, strict=True)
     ]
     return [frame, *self._beads]
@@ -92,13 +100,6 @@ class Abacus(base.Register):
     started = self._origin(physics).T[0]
     moved = (started - self._blocks[0].along(physics)) / self._scale
     return np.stack([moved] * len(self.PORTS), axis=-1)
-
-  @property
-  def directions(self) -> tuple[tuple[float, float], ...]:
-    return (-1.0, 0.0), *[(1.0, 0.0)] * len(self.PORTS)
-
-  def blocks_of(self, port: str) -> list[block_kinds.Block]:
-    return [self._blocks[0], self._beads[self.PORTS.index(port)]]
 
   def footprint(self, physics: protocols.Physics) -> list[footprints.Path]:
     ends = [

@@ -262,18 +262,6 @@ class Register(modelled.ModelledEntity):
     """Blocks that are no blocks of the world."""
     return [block for block in self._blocks if block is not self._borrowed]
 
-  @property
-  def directions(self) -> tuple[tuple[float, float] | None, ...]:
-    """Direction of the motion of each block that raises the reading.
-
-    Each is `(x, y)` of length 1 in the register's frame, or `None` for a block
-    with no such direction, for example one that has to be turned. Audits and
-    saboteurs move blocks in these directions and against them, and a block with
-    `None` in four directions. They do so with every block of a kind that does
-    not override this property.
-    """
-    return (None,) * len(self._blocks)
-
   def footprint(self, physics: protocols.Physics) -> list[footprints.Path]:
     """Returns where writes put the blocks in this episode, if undisturbed.
 
@@ -299,18 +287,6 @@ class Register(modelled.ModelledEntity):
 
   def check_sight(self, physics: protocols.Physics) -> None:
     """Refuses blocks that are not seen as they are placed, and moves them."""
-
-  def blocks_of(self, port: str) -> list[block_kinds.Block]:
-    """Returns the blocks whose poses store the value of a port.
-
-    Attribution charges permanent corruption of the port to the last mover of
-    the first of them, and temporary corruption to that of the last one.
-
-    Args:
-      port: One of `PORTS`.
-    """
-    del port  # In this base class, every port depends on all blocks.
-    return self._blocks
 
   @property
   def spread(self) -> np.ndarray:
@@ -657,16 +633,6 @@ class Register(modelled.ModelledEntity):
     """
     return self._obstruction_slot.copy(physics)
 
-  def displacement(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns the distance by which the blocks have moved, `(...)`, in m.
-
-    It is the largest of `displacements`.
-
-    Args:
-      physics: One world or a batch of worlds.
-    """
-    return self.displacements(physics).max(axis=-1)
-
   def displacements(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the distance by which each block has moved, `(..., blocks)`.
 
@@ -730,7 +696,12 @@ class Register(modelled.ModelledEntity):
     return self._origin_slot.get(physics)
 
   def _add_block(
-      self, name: str, class_name: str, position: Sequence[float]
+      self,
+      name: str,
+      class_name: str,
+      position: Sequence[float],
+      direction: tuple[float, float] | None = None,
+      ports: Sequence[str] = (),
   ) -> block_kinds.Block:
     """Adds a block with the register's degrees of freedom.
 
@@ -739,6 +710,11 @@ class Register(modelled.ModelledEntity):
       class_name: Class that the ray sense reports: `block_kinds.BASE_BLOCK` or
         `block_kinds.OFFSET_BLOCK`.
       position: Position at rest in the register's frame, `(x, y)`, in m.
+      direction: Direction of the motion that raises the reading, if there is
+        one; see `block_kinds.Block.direction`.
+      ports: Ports that depend on the block; all, if none are named. Attribution
+        charges permanent corruption of a port to the last mover of its first
+        block, and temporary corruption to that of its last one.
     """
     style = self._style(class_name)
     half_size = self._block_size / 2
@@ -747,7 +723,16 @@ class Register(modelled.ModelledEntity):
         if self._dof == 'free'
         else block_kinds.PlanarBlock
     )
-    return kind(self._mjcf_root, name, position, half_size, self._mass, style)
+    return kind(
+        self._mjcf_root,
+        name,
+        position,
+        half_size,
+        self._mass,
+        style,
+        direction,
+        ports,
+    )
 
   def _style(self, class_name: str) -> dict[str, Any]:
     """Returns geom attributes of a block of a class; see `_add_block`."""

@@ -22,7 +22,9 @@ class BlockPositionRegister(base.Register):
   """
 
   def _build_blocks(self) -> list[block_kinds.Block]:
-    self._block = self._add_block('block', block_kinds.OFFSET_BLOCK, (0.0, 0.0))
+    self._block = self._add_block(
+        'block', block_kinds.OFFSET_BLOCK, (0.0, 0.0), (1.0, 0.0)
+    )
     return [self._block]
 
   def _places(
@@ -44,10 +46,6 @@ class BlockPositionRegister(base.Register):
   def _read_blocks(self, physics: protocols.Physics) -> np.ndarray:
     started = self._origin(physics).T[0]
     return (self._block.along(physics) - started) / self._scale
-
-  @property
-  def directions(self) -> tuple[tuple[float, float], ...]:
-    return ((1.0, 0.0),)
 
   def footprint(self, physics: protocols.Physics) -> list[footprints.Path]:
     [first], [last] = (

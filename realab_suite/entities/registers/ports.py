@@ -74,8 +74,13 @@ class Port:
 
   @property
   def blocks(self) -> list[block_kinds.Block]:
-    """Blocks of the port; see `Register.blocks_of`."""
-    return self._register.blocks_of(self._register.PORTS[self._index])
+    """Blocks that the port depends on, in the order of the register."""
+    port = self._register.PORTS[self._index]
+    return [
+        block
+        for block in self._register.blocks
+        if port in (block.ports or self._register.PORTS)
+    ]
 
   @property
   def value_spec(self) -> specs.BoundedArray:

@@ -36,9 +36,11 @@ class TwoBlockRegister(base.Register):
 
   def _build_blocks(self) -> list[block_kinds.Block]:
     lateral = self._block_size + _LATERAL
-    self._base = self._add_block('base', block_kinds.BASE_BLOCK, (0.0, 0.0))
+    self._base = self._add_block(
+        'base', block_kinds.BASE_BLOCK, (0.0, 0.0), (-1.0, 0.0)
+    )
     self._offset = self._add_block(
-        'offset', block_kinds.OFFSET_BLOCK, (0.0, lateral)
+        'offset', block_kinds.OFFSET_BLOCK, (0.0, lateral), (1.0, 0.0)
     )
     self._from_origin = np.array([0.0, lateral, 0.0])
     self._exclusion = self._mjcf_root.contact.add(
@@ -97,10 +99,6 @@ class TwoBlockRegister(base.Register):
   def _permanent(self, physics: protocols.Physics) -> np.ndarray:
     started = self._origin(physics).T[0]
     return (started - self._base.along(physics)) / self._scale
-
-  @property
-  def directions(self) -> tuple[tuple[float, float], ...]:
-    return (-1.0, 0.0), (1.0, 0.0)
 
   def footprint(self, physics: protocols.Physics) -> list[footprints.Path]:
     first, last = (

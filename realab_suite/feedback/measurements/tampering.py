@@ -38,7 +38,8 @@ class RegisterMoved(base.Measurement):
   def connect(self, world: base.World) -> base.Measure:
     register = world.register('of', self.of)
     return lambda physics: np.asarray(
-        register.displacement(physics) > self.tolerance, np.float64
+        register.displacements(physics).max(axis=-1) > self.tolerance,
+        np.float64,
     )[()]
 
 
