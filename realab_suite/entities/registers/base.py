@@ -5,9 +5,8 @@ A register is any physical object that stores a value in a physical property
 this package contains no corruption function.
 """
 
-import abc
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, final
+from typing import Any, final
 
 from dm_control import composer
 from dm_control import mjcf
@@ -17,15 +16,14 @@ import numpy as np
 
 from realab_suite import errors
 from realab_suite.config import validation
-from realab_suite.entities import appearance
 from realab_suite.entities import axes
 from realab_suite.entities import block_kinds
-from realab_suite.entities import modelled
 from realab_suite.entities import protocols
 from realab_suite.entities import state
 from realab_suite.entities.registers import arguments as register_arguments
 from realab_suite.entities.registers import checks
 from realab_suite.entities.registers import footprints
+from realab_suite.entities.registers import kinds
 from realab_suite.entities.registers import records
 
 
@@ -38,37 +36,14 @@ class RegisterObservables(composer.Observables):
     return observable.Generic(self._entity.read)
 
 
-class Register(modelled.ModelledEntity):
+class Register(kinds.Kind):
   """Base class for registers, which store numbers in the poses of blocks.
 
   A register is one subtree that can be attached to the root entity of any task:
   `register.attach_to(arena, (x, y))`. It works in a plain Composer environment
-  as well as in the environments of this package.
-
-  A subclass builds its blocks in `_build_blocks`, says where they are for a
-  value in `_places`, and computes the represented value in `_read_blocks`. If
-  values turn blocks, or leave some of them alone, it overrides `_put`; if a
-  write changes less than the poses of the blocks, `_shift`. If a write does not
-  restore the coordinates that carry the value of all blocks, it returns the
-  resulting permanent corruption in `_permanent`.
-
-  A register stores one number, of the shape `(...)`, unless its class names
-  several *ports*:
-
-      class Abacus(registers.Register):
-        PORTS = 'upper', 'lower'
-
-  Its values and readings then have the shape `(..., ports)`, wherever this
-  class says `(...)`, and one write sets all of them. Everything outside the
-  register sees each port as a scalar register, `<register>_<port>`; see
-  `ports`. Masks of worlds keep the shape `(...)`.
-
-  Attributes:
-    PORTS: Names of the ports; none for a register that stores one number, which
-      is its own port.
+  as well as in the environments of this package. `kinds.Kind` has the methods
+  that a subclass overrides.
   """
-
-  PORTS: ClassVar[tuple[str, ...]] = ()
 
   def _build(
       self,
@@ -123,109 +98,6 @@ class Register(modelled.ModelledEntity):
 
   def _build_observables(self) -> RegisterObservables:
     return RegisterObservables(self)
-
-  @abc.abstractmethod
-  def _build_blocks(self) -> list[block_kinds.Block]:
-    """Adds the blocks with `_add_block` and returns them.
-
-    The position of the first block is the position of the register.
-    """
-
-  @abc.abstractmethod
-  def _places(
-      self, physics: protocols.Physics, value: np.ndarray
-  ) -> list[np.ndarray]:
-    """Returns the undisturbed position of each block, `(..., 3)`, in m.
-
-    Positions are in the register's frame. `_origin` is that of the first block
-    at the start of the episode.
-
-    Args:
-      physics: One world or a batch of worlds.
-      value: Value in the register's units, `(...)`.
-    """
-
-  def _put(
-      self,
-      physics: protocols.Physics,
-      value: np.ndarray,
-      where: axes.Mask = None,
-  ) -> None:
-    """Moves the blocks to the undisturbed poses of a value, `(...)`.
-
-    Episodes begin with these poses.
-
-    Args:
-      physics: One world or a batch of worlds.
-      value: Value in the register's units, `(...)`.
-      where: Worlds in which to move them, `(...)` bool; `None` for all worlds.
-    """
-    places = self._places(physics, value)
-    for block, place in zip(self._blocks, places, strict=True):
-      block.put(physics, place, where=where)
-
-  def _shift(
-      self,
-      physics: protocols.Physics,
-      value: np.ndarray,
-      where: axes.Mask = None,
-  ) -> np.ndarray:
-    """Changes only the coordinates that carry the value, as a write does.
-
-    Without this method, each write restores the poses of the blocks.
-
-    Args:
-      physics: One world or a batch of worlds.
-      value: Value in the register's units, `(...)`.
-      where: As in `_put`.
-
-    Returns:
-      Value that the blocks got, `(...)`: `value`, unless something immovable is
-      in the way.
-    """
-    self._put(physics, value, where)
-    return value
-
-  @abc.abstractmethod
-  def _read_blocks(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns the value that the blocks represent, `(...)`."""
-
-  def nearest(self, value: Any) -> Any:
-    """Returns the values that a write of values applies, `(...)`.
-
-    Kinds that cannot store every number of their range override this method, so
-    that rounding counts as saturation.
-
-    Args:
-      value: Values in the range, `(...)`; or nan, which stays.
-    """
-    return value
-
-  def read_without(
-      self,
-      physics: protocols.Physics,
-      is_gone: Callable[[np.ndarray], np.ndarray],
-  ) -> np.ndarray | None:
-    """Returns the reading if some of what is in the way were not there.
-
-    Args:
-      physics: One world or a batch of worlds.
-      is_gone: Function of the geoms that hide something, `(..., lines)`; -1 for
-        none. It returns True for those that are not there.
-
-    Returns:
-      The reading, `(...)`; `None` for kinds that nothing can hide, such as
-      those that read the poses of their blocks.
-    """
-    del physics, is_gone
-    return None
-
-  def _permanent(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns the permanent corruption, `(...)`, in the register's units.
-
-    It is the corruption that readings have immediately after a write.
-    """
-    return np.zeros_like(self._applied_slot.get(physics))
 
   @property
   def name(self) -> str:
@@ -343,45 +215,14 @@ class Register(modelled.ModelledEntity):
     if yaw:
       frame.quat = [np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]
     reach = np.array([self._low, self._high]) * self._scale
-    for own in self._blocks:
-      own.surroundings.limit(
-          reach[0] - spread[0], reach[1] + spread[0], spread[1]
-      )
-      if isinstance(own, block_kinds.PlanarBlock):
-        own.stand_at(height)
+    low, high = reach[0] - spread[0], reach[1] + spread[0]
+    for own_block in self._blocks:
+      own_block.surroundings.limit(low, high, spread[1])
+      if isinstance(own_block, block_kinds.PlanarBlock):
+        own_block.stand_at(height)
     if block is not None:
       self._use_block(root, block)
       self._borrowed = block
-
-  def check_can_use_a_block(self) -> None:
-    """Checks that the register can use a block of the world.
-
-    Raises:
-      SpecError: If its kind does not override `_use_block`, or it uses a block
-        of the world already.
-    """
-    if type(self)._use_block is Register._use_block:
-      problem = f'{type(self).__name__} has no base block'
-    elif self._borrowed is not None:
-      problem = 'it uses another block already'
-    else:
-      return
-    raise errors.SpecError(
-        f'register {self._name!r}: cannot use a block of the world: {problem};'
-        ' allowed are kinds with a base block, embedded or secure, such as'
-        ' two_block, and other places'
-    )
-
-  def _use_block(self, root: composer.Entity, block: block_kinds.Block) -> None:
-    """Replaces the base block by a block of the world, in `blocks` as well.
-
-    Kinds with a base block may override this method. The register is attached.
-
-    Args:
-      root: Root entity of the task.
-      block: Block of the world.
-    """
-    raise NotImplementedError  # See `check_can_use_a_block`.
 
   def detach_from_root(self) -> None:
     """Undoes `attach_to`."""
@@ -427,7 +268,9 @@ class Register(modelled.ModelledEntity):
     shape = (*origin.shape[:-1], *self._shape)
     initial = np.array(self._initial)
     if self._measure_initial is not None and is_initialized:
-      initial = self._start_value(self._measure_initial, physics, shape)
+      initial = self._saturated(
+          checks.start_value(self._name, self._measure_initial, physics, shape)
+      )
     self.pose(physics, np.full(shape, initial))
     if not is_initialized:
       self.inspect(physics)  # Refuses a wrong kind before any episode.
@@ -441,35 +284,6 @@ class Register(modelled.ModelledEntity):
         `(..., ports)` or `(..., 1)`, which are saturated to the range.
     """
     self._measure_initial = initial
-
-  def _start_value(
-      self,
-      measure: Callable[[Any], np.ndarray],
-      physics: protocols.Physics,
-      shape: tuple[int, ...],
-  ) -> np.ndarray:
-    """Returns the value at the start of an episode, `(...)`.
-
-    Args:
-      measure: What `start_with` was given.
-      physics: One world or a batch of worlds.
-      shape: Shape of the value.
-
-    Raises:
-      RegisterValueError: If it is not finite, or out of the range of a register
-        that does not saturate.
-    """
-    try:
-      value = np.asarray(measure(physics), np.float64)
-      value = np.broadcast_to(value, shape)
-    except Exception as error:  # The function is a task's.
-      raise errors.RegisterValueError(
-          f'register {self._name!r}: the function of its initial value:'
-          f' {type(error).__name__}: {error}; allowed are numbers of the shape'
-          f' {shape}'
-      ) from error
-    fits = (value >= self._low) & (value <= self._high)
-    return value if axes.everywhere(fits) else self._saturate(value, fits)
 
   def pose(self, physics: protocols.Physics, value: Any) -> None:
     """Moves the blocks to the undisturbed poses that represent a value.
@@ -526,9 +340,7 @@ class Register(modelled.ModelledEntity):
     if where is not None:  # An ignored value must not be refused.
       is_used = where[..., np.newaxis] if self.PORTS else where
       value = np.where(is_used, value, self._initial)
-    fits = (value >= self._low) & (value <= self._high)  # False for NaN.
-    applied = value if axes.everywhere(fits) else self._saturate(value, fits)
-    applied = self.nearest(applied)
+    applied = self.nearest(self._saturated(value))
     if self._write == 'pose':
       self._put(physics, applied, where)
       placed = applied
@@ -553,26 +365,15 @@ class Register(modelled.ModelledEntity):
     if self._channel == 'secure':
       self._stored_slot.set(physics, applied, where)
 
-  def _saturate(self, value: np.ndarray, fits: np.ndarray) -> np.ndarray:
-    """Returns the values, saturated to the range of the register.
-
-    Raises:
-      RegisterValueError: If the register refuses a value.
-    """
-    is_finite = np.isfinite(value)
-    if not is_finite.all():
-      raise checks.refusal(
-          self._name, value, ~is_finite, 'allowed are finite values', self.PORTS
-      )
-    if self._on_overflow == 'error':
-      raise checks.refusal(
-          self._name,
-          value,
-          ~fits,
-          f'its range is [{self._low}, {self._high}]',
-          self.PORTS,
-      )
-    return np.where(fits, value, np.clip(value, self._low, self._high))[()]
+  def _saturated(self, value: np.ndarray) -> np.ndarray:
+    """Returns values, `(...)`, saturated to the range, or refuses them."""
+    return checks.saturated(
+        value,
+        self.value_range,
+        self._name,
+        self.PORTS,
+        is_strict=self._on_overflow == 'error',
+    )
 
   def read(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the reading, `(...)`, in the register's units.
@@ -633,23 +434,6 @@ class Register(modelled.ModelledEntity):
     """
     return self._obstruction_slot.copy(physics)
 
-  def displacements(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns the distance by which each block has moved, `(..., blocks)`.
-
-    It is the distance in m from the position that the reset and the last write
-    gave the block, in any direction, and is computed from the blocks even if
-    the register is secure.
-
-    Args:
-      physics: One world or a batch of worlds.
-    """
-    places = self._places(physics, self._applied_slot.get(physics))
-    moved = [
-        np.linalg.norm(block.position(physics) - place, axis=-1)
-        for block, place in zip(self._blocks, places, strict=True)
-    ]
-    return np.stack(moved, axis=-1)
-
   def inspect(
       self,
       physics: protocols.Physics,
@@ -690,52 +474,3 @@ class Register(modelled.ModelledEntity):
         temporary,
         self._clean_slot.copy(physics),
     )
-
-  def _origin(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns the start position of the first block, `(..., 3)`, in m."""
-    return self._origin_slot.get(physics)
-
-  def _add_block(
-      self,
-      name: str,
-      class_name: str,
-      position: Sequence[float],
-      direction: tuple[float, float] | None = None,
-      ports: Sequence[str] = (),
-  ) -> block_kinds.Block:
-    """Adds a block with the register's degrees of freedom.
-
-    Args:
-      name: Name of the block within the register.
-      class_name: Class that the ray sense reports: `block_kinds.BASE_BLOCK` or
-        `block_kinds.OFFSET_BLOCK`.
-      position: Position at rest in the register's frame, `(x, y)`, in m.
-      direction: Direction of the motion that raises the reading, if there is
-        one; see `block_kinds.Block.direction`.
-      ports: Ports that depend on the block; all, if none are named. Attribution
-        charges permanent corruption of a port to the last mover of its first
-        block, and temporary corruption to that of its last one.
-    """
-    style = self._style(class_name)
-    half_size = self._block_size / 2
-    kind = (
-        block_kinds.FreeBlock
-        if self._dof == 'free'
-        else block_kinds.PlanarBlock
-    )
-    return kind(
-        self._mjcf_root,
-        name,
-        position,
-        half_size,
-        self._mass,
-        style,
-        direction,
-        ports,
-    )
-
-  def _style(self, class_name: str) -> dict[str, Any]:
-    """Returns geom attributes of a block of a class; see `_add_block`."""
-    index = int(class_name == block_kinds.OFFSET_BLOCK)
-    colour = appearance.ROLE_COLOURS[self._role][index]
-    return appearance.geom_style(class_name, colour)

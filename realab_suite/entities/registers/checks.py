@@ -1,12 +1,14 @@
-"""Refusals of values and of register kinds."""
+"""Checks of values and of register kinds."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 import re
 from typing import Any
 
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.entities import axes
+from realab_suite.entities import protocols
 
 
 def check_ports(name: str, ports: Sequence[str]) -> None:
@@ -24,7 +26,67 @@ def check_ports(name: str, ports: Sequence[str]) -> None:
     )
 
 
-def refusal(
+def saturated(
+    value: np.ndarray,
+    value_range: tuple[float, float],
+    name: str,
+    ports: Sequence[str],
+    is_strict: bool,
+) -> np.ndarray:
+  """Returns values that are saturated to the range of a register.
+
+  Args:
+    value: Values, `(...)`, or `(..., ports)`.
+    value_range: Lowest and highest value that can be stored.
+    name: Name of the register.
+    ports: Names of its ports.
+    is_strict: True to refuse values out of the range.
+
+  Raises:
+    RegisterValueError: If a value is not finite, or is refused.
+  """
+  low, high = value_range
+  fits = (value >= low) & (value <= high)  # False for NaN.
+  if axes.everywhere(fits):
+    return value
+  is_finite = np.isfinite(value)
+  if not is_finite.all():
+    raise _refusal(name, value, ~is_finite, 'allowed are finite values', ports)
+  if is_strict:
+    raise _refusal(name, value, ~fits, f'its range is [{low}, {high}]', ports)
+  clipped: np.ndarray = np.where(fits, value, np.clip(value, low, high))[()]
+  return clipped
+
+
+def start_value(
+    name: str,
+    measure: Callable[[Any], np.ndarray],
+    physics: protocols.Physics,
+    shape: tuple[int, ...],
+) -> np.ndarray:
+  """Returns the value of a register at the start of an episode.
+
+  Args:
+    name: Name of the register.
+    measure: Function of the task that returns it.
+    physics: One world or a batch of worlds.
+    shape: Shape of the value.
+
+  Raises:
+    RegisterValueError: If the function fails or returns another shape.
+  """
+  try:
+    value = np.asarray(measure(physics), np.float64)
+    return np.broadcast_to(value, shape)
+  except Exception as error:  # The function is a task's.
+    raise errors.RegisterValueError(
+        f'register {name!r}: the function of its initial value:'
+        f' {type(error).__name__}: {error}; allowed are numbers of the shape'
+        f' {shape}'
+    ) from error
+
+
+def _refusal(
     name: str,
     value: np.ndarray,
     is_wrong: np.ndarray,
