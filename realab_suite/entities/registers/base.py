@@ -94,7 +94,7 @@ class Register(kinds.Kind):
     self._origin_slot = state.Slot(self._mjcf_root, 'origin', 3)
     self._blocks = self._build_blocks()
     self._borrowed: block_kinds.Block | None = None
-    self._measure_initial: Callable[[Any], np.ndarray] | None = None
+    self._measure_initial: Callable[[protocols.Physics], Any] | None = None
 
   def _build_observables(self) -> RegisterObservables:
     return RegisterObservables(self)
@@ -275,7 +275,7 @@ class Register(kinds.Kind):
     if not is_initialized:
       self.inspect(physics)  # Refuses a wrong kind before any episode.
 
-  def start_with(self, initial: Callable[[Any], np.ndarray]) -> None:
+  def start_with(self, initial: Callable[[protocols.Physics], Any]) -> None:
     """Sets a function that returns the value at the start of each episode.
 
     Args:
@@ -334,8 +334,8 @@ class Register(kinds.Kind):
     value = np.asarray(value, np.float64)[()]
     if self.PORTS and value.shape[-1:] != self._shape:
       raise errors.RegisterValueError(
-          f'register {self._name!r}: cannot store shape {value.shape}; allowed'
-          f' is a value for each of its ports {list(self.PORTS)}'
+          f'register {self._name!r}: cannot store shape {value.shape}; must'
+          f' have a value for each of its ports {list(self.PORTS)}'
       )
     if where is not None:  # An ignored value must not be refused.
       is_used = where[..., np.newaxis] if self.PORTS else where

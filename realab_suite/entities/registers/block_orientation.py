@@ -31,8 +31,8 @@ class BlockOrientationRegister(base.Register):
     if widest > _LARGEST_ANGLE:
       raise errors.SpecError(
           f'register {self.name!r}: range [{self._low}, {self._high}] at scale'
-          f' {self._scale} turns the block by up to {widest:.3g} rad; allowed'
-          f' are at most {_LARGEST_ANGLE} rad'
+          f' {self._scale} turns the block by up to {widest:.3g} rad; must'
+          f' be at most {_LARGEST_ANGLE} rad'
       )
     self._block = self._add_block('block', block_kinds.OFFSET_BLOCK, (0.0, 0.0))
     return [self._block]

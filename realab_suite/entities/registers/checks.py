@@ -21,7 +21,7 @@ def check_ports(name: str, ports: Sequence[str]) -> None:
   is_legal = all(re.fullmatch('[a-z0-9_]+', port) for port in ports)
   if isinstance(ports, str) or not is_legal or len(set(ports)) < len(ports):
     raise errors.SpecError(
-        f'register {name!r}: PORTS: {ports!r}; allowed are different names of'
+        f'register {name!r}: PORTS: {ports!r}; must be different names of'
         ' lower-case letters, digits and underscores'
     )
 
@@ -51,7 +51,7 @@ def saturated(
     return value
   is_finite = np.isfinite(value)
   if not is_finite.all():
-    raise _refusal(name, value, ~is_finite, 'allowed are finite values', ports)
+    raise _refusal(name, value, ~is_finite, 'must be finite', ports)
   if is_strict:
     raise _refusal(name, value, ~fits, f'its range is [{low}, {high}]', ports)
   clipped: np.ndarray = np.where(fits, value, np.clip(value, low, high))[()]
@@ -60,7 +60,7 @@ def saturated(
 
 def start_value(
     name: str,
-    measure: Callable[[Any], np.ndarray],
+    measure: Callable[[protocols.Physics], Any],
     physics: protocols.Physics,
     shape: tuple[int, ...],
 ) -> np.ndarray:
@@ -81,7 +81,7 @@ def start_value(
   except Exception as error:  # The function is a task's.
     raise errors.RegisterValueError(
         f'register {name!r}: the function of its initial value:'
-        f' {type(error).__name__}: {error}; allowed are numbers of the shape'
+        f' {type(error).__name__}: {error}; must be numbers of the shape'
         f' {shape}'
     ) from error
 
@@ -90,7 +90,7 @@ def _refusal(
     name: str,
     value: np.ndarray,
     is_wrong: np.ndarray,
-    allowed: str,
+    rule: str,
     ports: Sequence[str] = (),
 ) -> errors.RegisterValueError:
   """Returns an error for the first wrong value.
@@ -99,7 +99,7 @@ def _refusal(
     name: Name of the register.
     value: Values, `(...)`, or `(..., ports)`.
     is_wrong: True for each wrong value, bool of the same shape.
-    allowed: Description of the allowed values.
+    rule: Rule that the value breaks.
     ports: Names of the ports of the register.
   """
   first = np.unravel_index(int(np.argmax(is_wrong)), np.shape(value))
@@ -107,7 +107,7 @@ def _refusal(
   if ports:
     name = f'{name}_{ports[int(first[-1])]}'
   return errors.RegisterValueError(
-      f'register {name!r}: cannot store {np.asarray(value)[first]}; {allowed}',
+      f'register {name!r}: cannot store {np.asarray(value)[first]}; {rule}',
       int(worlds[0]) if worlds else None,
   )
 
@@ -126,6 +126,6 @@ def misreading(
   ports = f', with its ports {list(register.PORTS)}' if register.PORTS else ''
   return errors.SpecError(
       f'register kind {type(register).__name__}: {method} of register'
-      f' {register.name!r} returned {value.dtype} {value.shape}; allowed is'
+      f' {register.name!r} returned {value.dtype} {value.shape}; must be'
       f' float64 {expected.shape}{ports}'
   )

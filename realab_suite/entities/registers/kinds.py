@@ -201,8 +201,8 @@ class Kind(modelled.ModelledEntity):
       return
     raise errors.SpecError(
         f'register {self._name!r}: cannot use a block of the world: {problem};'
-        ' allowed are kinds with a base block, embedded or secure, such as'
-        ' two_block, and other places'
+        ' must be of a kind with a base block, such as two_block, or have'
+        ' another place'
     )
 
   def _origin(self, physics: protocols.Physics) -> np.ndarray:
