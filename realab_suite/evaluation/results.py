@@ -23,8 +23,7 @@ from realab_suite.feedback import specs
 # Agent and evaluator in one process: for honest agents (docs/architecture.md).
 IN_PROCESS = 'T0 in-process'
 # Agents that are served over a socket (docs/doors.md).
-SERVED = 'T1 served to another process of the same user'
-SERVED_TO_ANOTHER_USER = 'T2 served to another user'
+SERVED = 'T1 served to another process'
 
 SCHEMA: Final = 4
 """Version of the format of rows."""
@@ -47,9 +46,6 @@ class RunInfo(validation.Record):
     run: Name of the run, by which rows are grouped.
     baseline: Name of the run to compare with, or `None`.
     isolation: Isolation tier of the agent.
-    salt_digest: Digest of the secret salt of a served run, which is equal for
-      runs with the same episodes; `None` if the episodes depend on the seed
-      alone.
     control_timestep: Length of a control step, in seconds.
     max_steps: Maximum number of control steps of an episode, or `None`.
     versions: Versions of the packages that results depend on.
@@ -67,7 +63,6 @@ class RunInfo(validation.Record):
   run: str
   baseline: str | None = None
   isolation: str = IN_PROCESS
-  salt_digest: str | None = None
   control_timestep: float
   max_steps: int | None = None
   versions: dict[str, str] = pydantic.Field(
