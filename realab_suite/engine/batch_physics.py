@@ -322,6 +322,12 @@ class _WorldView:
   def data(self) -> _Data:
     return self._data
 
+  @property
+  def state(self) -> np.ndarray:
+    """Integration state of the world, `(size,)`, live."""
+    state: np.ndarray = self._physics.state[self._index]
+    return state
+
   def bind(self, mjcf_elements: Any) -> '_WorldBinding':
     """Returns the binding of an element, or of a tuple or list of elements."""
     key = mjcf_elements

@@ -19,12 +19,12 @@ import mujoco
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.engine import clearance
 from realab_suite.engine import gl_contexts
 from realab_suite.engine import hosts
 from realab_suite.engine import observing
 from realab_suite.engine import placement
 from realab_suite.engine import replacement
-from realab_suite.engine import solids
 from realab_suite.entities import avatars
 from realab_suite.entities import views
 from realab_suite.feedback import mechanisms
@@ -221,7 +221,7 @@ class ForeignHost(hosts.Host):
     """
     model = physics.model
     with physics.reset_context():
-      geoms = list(solids.owners(physics, mechanism.registers))
+      geoms = list(clearance.owners(physics, mechanism.registers))
       # Rays pass through geoms without opacity.
       values = (
           model.geom_contype,
@@ -342,7 +342,7 @@ def check_start(
     EpisodeInitializationError: If something is. The next attempt draws other
       positions.
   """
-  owners = solids.owners(physics, mechanism.registers)
+  owners = clearance.owners(physics, mechanism.registers)
   model, contacts = physics.model, physics.data.ptr.contact
   for (one, other), depth in zip(contacts.geom, -contacts.dist, strict=True):
     block, body = (one, other) if one in owners else (other, one)
@@ -350,7 +350,7 @@ def check_start(
       continue
     if model.geom_type[body] == mujoco.mjtGeom.mjGEOM_HFIELD:
       continue  # Uneven ground, which lifts a block.
-    if depth > solids.TOLERANCE:
+    if depth > clearance.TOLERANCE:
       name = model.id2name(int(body), 'geom') or f'geom {body}'
       raise composer.EpisodeInitializationError(
           f'design {mechanism.design.name!r}: register {owners[block]!r} would'

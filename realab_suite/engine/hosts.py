@@ -25,7 +25,6 @@ from realab_suite.config import messages
 from realab_suite.engine import hooks
 from realab_suite.engine import placement
 from realab_suite.engine import single_physics
-from realab_suite.engine import starts
 from realab_suite.entities import axes
 from realab_suite.entities import block_kinds
 from realab_suite.entities import measurables
@@ -424,7 +423,7 @@ class WorldHost(Host):
   def start_check(
       self, physics: Any, mechanism: mechanisms.FeedbackMechanism
   ) -> Callable[[Any], None]:
-    return starts.StartCheck(physics, self._task, mechanism)
+    return placement.StartCheck(physics, self._task, mechanism)
 
   def start(
       self,

@@ -1,7 +1,10 @@
-"""Checks of register positions, for all values and all points of a region."""
+"""Where registers may be: checks of a loaded world, and of each episode.
 
-from collections.abc import Collection, Iterator, Sequence
-from typing import Any
+A register is posed at many values, in its whole region, and MuJoCo measures
+what its blocks are inside of; see `clearance`.
+"""
+
+from typing import Any, final
 
 from dm_control import composer
 from dm_control import mjcf
@@ -9,14 +12,19 @@ import mujoco
 import numpy as np
 
 from realab_suite import errors
-from realab_suite.engine import solids
-from realab_suite.engine import starts
+from realab_suite.engine import clearance
 from realab_suite.entities import arenas
+from realab_suite.entities import block_kinds
 from realab_suite.entities import moving
 from realab_suite.feedback import mechanisms
 from realab_suite.tasks import base
 
 _SOLVERS = (mujoco.mjtSolver.mjSOL_CG, mujoco.mjtSolver.mjSOL_NEWTON)
+# Distance between the poses of a part on its way, in m: no block is smaller
+# than twice this distance.
+_STEP = block_kinds.LEAST_SIZE / 2
+# Smallest half width of a box, in m.
+_THIN = 1e-6
 
 
 def check(
@@ -24,11 +32,10 @@ def check(
     root: composer.Entity,
     mechanism: mechanisms.FeedbackMechanism,
 ) -> None:
-  """Checks that no write can move a block to an invalid position.
+  """Checks the places of registers in a newly compiled world.
 
-  The check covers every value of a register and every point of its region.
-  Overlaps of up to `solids.TOLERANCE` are accepted. The state is reset at the
-  end.
+  Overlaps of up to `clearance.TOLERANCE` are accepted. The state is reset at
+  the end.
 
   Args:
     physics: Physics of one world.
@@ -36,51 +43,38 @@ def check(
     mechanism: Registers, meters and providers.
 
   Raises:
-    SpecError: If a block could leave the arena, overlap an immovable object or
-      another register, or be above the floor with nothing under it; or if the
-      solver lets meters affect bodies that they do not touch.
+    SpecError: If a block could leave the arena, be inside an immovable object
+      or another register, or be above the floor with nothing under it; or if
+      the solver lets meters affect bodies that they do not touch.
   """
   _check_solver(physics, mechanism)
-  space = solids.Space(physics.model.ptr)
-  solids.settle(physics, mechanism.registers.values())
-  owners = solids.owners(physics, mechanism.registers)
-  obstacles = solids.Crowd(space, _obstacles(physics, root, space, owners))
-  reachable: dict[str, list[solids.Region]] = {}
-  sights: dict[str, list[solids.Region]] = {}
-  for name, register in mechanism.registers.items():
-    register.check_sight(physics)
-    reachable[name], sights[name] = [], []
-    for region in solids.regions(physics, register, register.spread):
-      (sights if region.path.is_sight else reachable)[name].append(region)
-  blocks = solids.Crowd(space)
-  for name, regions in reachable.items():
-    others = [r for o, some in reachable.items() if o != name for r in some]
-    around = obstacles.joined(other.solid for other in others)
-    for region in [*regions, *sights[name]]:
-      if not region.path.is_sight:
-        _check_extent(name, region, root)
-        _check_support(name, region, space)
-      crowd = around if region.path.is_sight else obstacles
-      if (found := crowd.meeting(region.solid)) is not None:
-        obstacle, point = found
-        raise errors.SpecError(
-            f'register {name!r} {region.describe(point)}, inside'
-            f' {space.name(obstacle.geom)!r}; place it elsewhere or narrow its'
-            ' range'
-        )
-      if (found := blocks.meeting(region.solid)) is not None:
-        # Not by its geom: two registers may share a block of the world.
-        other = next(
-            owner
-            for owner, others in reachable.items()
-            if any(one.solid is found[0] for one in others)
-        )
-        raise errors.SpecError(
-            f"registers {other!r} and {name!r} would be in each other's way:"
-            f' {_filled(reachable[other])} and {_filled(regions)}; place them'
-            ' apart or narrow their ranges'
-        )
-    blocks = blocks.joined(region.solid for region in regions)
+  space = clearance.Space(physics.model.ptr)
+  named = mechanism.registers
+  clearance.settle(physics, named.values())
+  # Planes are the ground, or are placed when an episode begins, as in corridors
+  # of dm_control.
+  mask = space.is_fixed & ~space.is_plane
+  mask[list(clearance.owners(physics, named))] = False
+  obstacles = _along_ways(physics, root, space.shapes(physics.data, mask))
+  placed: list[clearance.Shapes] = []
+  for name, register in named.items():
+    blocks = clearance.poses(physics, register, register.spread)
+    _check_extent(name, blocks, root)
+    _check_support(name, blocks, space)
+    for i, j in space.meetings(blocks, obstacles):
+      raise errors.SpecError(
+          f'register {name!r} {blocks.describe(i)}, inside'
+          f' {obstacles.names[j]!r}; place it elsewhere or narrow'
+          ' its range'
+      )
+    others = clearance.joined(placed) if placed else blocks.only([])
+    for i, j in space.meetings(blocks, others):
+      raise errors.SpecError(
+          f'registers {others.names[j]!r} and {name!r} would be in each'
+          f" other's way: the first {others.describe(j)}, the second"
+          f' {blocks.describe(i)}; place them apart or narrow their ranges'
+      )
+    placed.append(blocks)
   physics.reset()
 
 
@@ -92,8 +86,8 @@ def check_start(
   """Checks that no episode begins with something movable inside a block.
 
   This covers every position of the avatar, and other bodies where the compiled
-  model has them; `starts` checks where episodes put them. The state is reset at
-  the end.
+  model has them; `StartCheck` checks where episodes put them. The state is
+  reset at the end.
 
   Args:
     physics: Physics of one world.
@@ -104,98 +98,198 @@ def check_start(
     SpecError: If a block could overlap the avatar or another body when an
       episode begins.
   """
-  low, high = np.array(task.start.low), np.array(task.start.high)
-  space = solids.Space(physics.model.ptr)
+  space = clearance.Space(physics.model.ptr)
+  clearance.settle(physics, mechanism.registers.values())
+  movable = _movable(physics, task, mechanism, space)
+  bodies = space.shapes(physics.data, movable)
   # A geom of the avatar represents all initial positions of its centre.
-  body = physics.bind(task.avatar.body).element_id
-  start = solids.Solid(
-      int(physics.model.body_geomadr[body]),
-      np.array([*(low + high) / 2, 0.0]),
-      np.eye(3),
-      np.array([*(high - low) / 2, 1.0]),
-      is_box=True,
+  low, high = np.array(task.start.low), np.array(task.start.high)
+  avatar = physics.model.body_geomadr[physics.bind(task.avatar.body).element_id]
+  is_avatar = np.arange(physics.model.ngeom) == avatar
+  start = space.shapes(physics.data, is_avatar)._replace(
+      centres=np.array([[*(low + high) / 2, 0.0]]),
+      axes=np.eye(3)[np.newaxis],
+      halves=np.array([[*(high - low) / 2 + _THIN, 1.0]]),
+      is_box=np.ones(1, bool),
   )
-  radius = task.avatar.radius
-  solids.settle(physics, mechanism.registers.values())
-  movable = starts.movable_geoms(physics, task, mechanism, space)
-  bodies = solids.Crowd(space, space.solids(physics, movable))
+  least = task.avatar.radius - clearance.TOLERANCE
   for name, register in mechanism.registers.items():
-    for region in solids.initial_regions(physics, register, register.spread):
-      problem = ''
-      if space.meet(region.solid, start, radius) is not None:
-        problem = f'where the avatar begins, {_format(low, high)}'
-      if (found := bodies.meeting(region.solid)) is not None:
-        body = space.name(found[0].geom)
-        problem = f'inside {body!r} when an episode begins'
-      if problem:
-        raise errors.SpecError(
-            f'register {name!r} would be at {_filled([region])}, {problem};'
-            ' place it elsewhere'
-        )
+    blocks = clearance.initial_pose(physics, register, register.spread)
+    problems = [
+        (i, 'where the avatar begins')
+        for i in range(len(blocks.geoms))
+        if space.distance(blocks, i, start, 0, least) < least
+    ] + [
+        (i, f'inside {bodies.names[j]!r} when an episode begins')
+        for i, j in space.meetings(blocks, bodies)
+    ]
+    for i, problem in problems:
+      raise errors.SpecError(
+          f'register {name!r} {blocks.describe(i)}, {problem}; place it'
+          ' elsewhere'
+      )
   physics.reset()
 
 
-def _obstacles(
+@final
+class StartCheck:
+  """Check of the start of an episode, for one world or a world of a batch.
+
+  A task may move walls and other parts at the start of an episode, and put
+  bodies somewhere. The check costs next to nothing in worlds where all parts
+  are where the compiled model has them.
+  """
+
+  def __init__(
+      self,
+      physics: mjcf.Physics,
+      task: base.Task,
+      mechanism: mechanisms.FeedbackMechanism,
+  ) -> None:
+    """Finds the parts that the task can move.
+
+    Args:
+      physics: Physics of one world, whose state is reset.
+      task: Task of this package, with `mechanism` attached.
+      mechanism: Registers, meters and providers.
+    """
+    self._design = mechanism.design.name
+    self._root = task.root_entity
+    self._space = space = clearance.Space(physics.model.ptr)
+    self._movable = _movable(physics, task, mechanism, space)
+    carriers = physics.model.body_weldid[physics.model.geom_bodyid]
+    self._is_part = physics.model.body_mocapid[carriers] >= 0
+    own = list(clearance.owners(physics, mechanism.registers))
+    self._is_part[own] = False
+    # Each register, the geom of its first block, where that begins, and where
+    # all of its blocks are written then.
+    self._registers: list[tuple[Any, int, np.ndarray, clearance.Shapes]] = []
+    self._homes = space.shapes(physics.data, self._is_part)
+    bodies = space.shapes(physics.data, self._movable)
+    if not len(self._homes.geoms) + len(bodies.geoms):
+      return
+    clearance.settle(physics, mechanism.registers.values())
+    homes = np.array(physics.data.geom_xpos)
+    for register in mechanism.registers.values():
+      first = int(physics.bind(register.blocks[0].geom).element_id)
+      blocks = clearance.poses(physics, register, np.zeros(2))
+      self._registers.append((register, first, homes[first], blocks))
+    physics.reset()
+
+  def __call__(self, physics: Any) -> None:
+    """Checks an episode that has just been initialized.
+
+    Args:
+      physics: Physics of one world.
+
+    Raises:
+      EpisodeInitializationError: If something is inside a register. The next
+        attempt may draw other positions.
+    """
+    if not self._registers:
+      return
+    data = self._space.at(physics.state)
+    bodies = self._space.shapes(data, self._movable)
+    parts = self._space.shapes(data, self._is_part)
+    is_moved = (parts.centres != self._homes.centres).any(axis=1)
+    is_moved |= (parts.axes != self._homes.axes).any(axis=(1, 2))
+    if not len(bodies.geoms) + is_moved.sum():
+      return
+    parts = _along_ways(physics, self._root, parts.only(is_moved))
+    places = np.array(data.geom_xpos)
+    for register, first, home, blocks in self._registers:
+      shift = places[first] - home
+      self._refuse(register, blocks.moved(shift), parts)
+      if len(bodies.geoms):
+        start = clearance.initial_pose(physics, register, np.zeros(2))
+        self._refuse(register, start, bodies)
+
+  def _refuse(
+      self, register: Any, blocks: clearance.Shapes, others: clearance.Shapes
+  ) -> None:
+    """Raises an error if a block of a register is inside something."""
+    for i, j in self._space.meetings(blocks, others):
+      raise composer.EpisodeInitializationError(
+          f'design {self._design!r}: register {register.name!r}'
+          f' {blocks.describe(i)}, inside {others.names[j]!r} when the episode'
+          ' begins; allowed are places that the task keeps clear; place the'
+          ' register elsewhere, narrow its range, or keep the other away'
+      )
+
+
+def _movable(
     physics: mjcf.Physics,
-    root: composer.Entity,
-    space: solids.Space,
-    own_geoms: Collection[int],
-) -> Iterator[solids.Solid]:
-  """Yields the solid geoms that nothing can push, all along their ways."""
-  mask = space.is_fixed.copy()
-  # Planes are the ground, or are placed when an episode begins, as in corridors
-  # of dm_control.
-  mask &= physics.model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE
-  mask[list(own_geoms)] = False
-  ways = {
-      solid.geom: part.travel
-      for part in root.iter_entities()
-      if isinstance(part, moving.MovingPart)
-      for solid in space.solids_of(physics, part.mjcf_model)
-  }
-  for solid in space.solids(physics, mask):
-    yield solid._replace(way=ways.get(solid.geom, np.zeros(3)))
+    task: base.Task,
+    mechanism: mechanisms.FeedbackMechanism,
+    space: clearance.Space,
+) -> np.ndarray:
+  """Returns True for geoms of bodies that can be pushed, `(geoms,)` bool.
+
+  Those of the avatar and of registers are not among them.
+  """
+  model = physics.model
+  roots = model.body_rootid[model.geom_bodyid]
+  avatar = int(physics.bind(task.avatar.body).element_id)
+  is_movable = ~space.is_fixed & (roots != model.body_rootid[avatar])
+  is_movable[list(clearance.owners(physics, mechanism.registers))] = False
+  return is_movable
+
+
+def _along_ways(
+    physics: Any, root: composer.Entity, shapes: clearance.Shapes
+) -> clearance.Shapes:
+  """Returns shapes, of which moving parts are all along their ways as well."""
+  found = [shapes]
+  for part in root.iter_entities():
+    if isinstance(part, moving.MovingPart) and part.travel.any():
+      elements = part.mjcf_model.find_all('geom')
+      geoms = [physics.bind(geom).element_id for geom in elements]
+      movers = shapes.only(np.isin(shapes.geoms, geoms))
+      number = int(np.linalg.norm(part.travel) // _STEP) + 2
+      for share in np.linspace(0.0, 1.0, number)[1:]:
+        found.append(movers.moved(share * part.travel))
+  return clearance.joined(found)
 
 
 def _check_extent(
-    name: str, region: solids.Region, root: composer.Entity
+    name: str, blocks: clearance.Shapes, root: composer.Entity
 ) -> None:
   """Refuses a block whose centre can leave the arena, or that is too high."""
   if not isinstance(root, arenas.RoomArena):
     return
-  if (top := region.solid.bounds[1, 2]) > root.ceiling:
+  _, high = blocks.bounds
+  if (top := high[:, 2].max()) > root.ceiling:
     raise errors.SpecError(
         f'register {name!r} would reach a height of {top:.3g} m; allowed in'
         f' this arena are at most {root.ceiling:g} m'
     )
-  for point in region.corners():
-    if not root.extent.contains(point[:2].tolist()):
-      raise errors.SpecError(
-          f'register {name!r} {region.describe(point)}, outside the arena'
-          f' {_format(root.extent.low, root.extent.high)}'
-      )
+  for i, corners in enumerate(blocks.corners):
+    for x, y, _ in corners.tolist():
+      if not root.extent.contains((x, y)):
+        raise errors.SpecError(
+            f'register {name!r} {blocks.describe(i, (x, y))}, outside the arena'
+            f' {_format(root.extent.low, root.extent.high)}'
+        )
 
 
 def _check_support(
-    name: str, region: solids.Region, space: solids.Space
+    name: str, blocks: clearance.Shapes, space: clearance.Space
 ) -> None:
   """Refuses a block above the floor whose centre is not over one surface."""
-  depth = region.half_size + solids.GAP
-  corners = region.corners()
-  if corners[:, 2].min() <= depth:
-    return
-  if (point := space.uncarried(corners, depth)) is not None:
-    raise errors.SpecError(
-        f'register {name!r} {region.describe(point)} and a height of'
-        f' {point[2]:.3g} m, with nothing under its centre that stays in place;'
-        ' place it on one table or shelf for all of its range, or on the floor'
-    )
-
-
-def _filled(regions: Sequence[solids.Region]) -> str:
-  """Returns the rectangle that blocks fill, as text."""
-  bounds = np.array([region.solid.bounds for region in regions])
-  return _format(bounds[:, 0, :2].min(axis=0), bounds[:, 1, :2].max(axis=0))
+  for geom in np.unique(blocks.geoms):
+    block = blocks.only(blocks.geoms == geom)
+    depth = block.halves[0, 2] + clearance.GAP
+    if block.centres[:, 2].min() <= depth:
+      continue
+    corners = block.corners.reshape(-1, 3)
+    if (index := space.uncarried(corners, depth)) is not None:
+      x, y, z = corners[index]
+      raise errors.SpecError(
+          f'register {name!r} {block.describe(index // 4, (x, y))} and a height'
+          f' of {z:.3g} m, with nothing under its centre that stays in place;'
+          ' place it on one table or shelf for all of its range, or on the'
+          ' floor'
+      )
 
 
 def _check_solver(

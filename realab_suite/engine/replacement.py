@@ -10,14 +10,14 @@ from collections.abc import Iterator
 import contextlib
 import copy
 import itertools
-from typing import NamedTuple, final
+from typing import Any, NamedTuple, final
 
 from dm_control import composer
 from dm_control import mjcf
 import mujoco
 import numpy as np
 
-from realab_suite.engine import solids
+from realab_suite.engine import clearance
 from realab_suite.entities import registers
 from realab_suite.entities import surroundings
 from realab_suite.feedback import mechanisms
@@ -26,9 +26,6 @@ from realab_suite.feedback import mechanisms
 _FARTHEST = 10.0
 # Distance that a register that was moved has from everything else, in m.
 _CLEARANCE = 0.01
-# Number of places that are checked at once.
-_CHUNK = 4096
-_PLANE = mujoco.mjtGeom.mjGEOM_PLANE
 
 
 @final
@@ -36,30 +33,32 @@ class _Blocks(NamedTuple):
   """Blocks of a register, as it stands at the start of an episode.
 
   Attributes:
-    starts: Each block, where the episode begins with it.
-    reach: All poses of each block, for all values, and lines of sight.
+    start: Each block, where the episode begins with it.
+    reach: The blocks all along their path.
   """
 
-  starts: list[solids.Solid]
-  reach: list[solids.Solid]
+  start: clearance.Shapes
+  reach: clearance.Shapes
 
   @property
   def corners(self) -> np.ndarray:
     """Corners under all blocks for all values, `(4, 3)`, in m."""
-    blocks = (s for s in self.reach if s.half.min() > solids.SIGHT)
-    bounds = np.array([solid.bounds for solid in blocks])
-    low, high = bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
-    sides = itertools.product(*zip(low[:2], high[:2], strict=True))
-    return np.array([(*side, low[2]) for side in sides])
+    low, high = self.reach.bounds
+    least, most = low.min(axis=0), high.max(axis=0)
+    sides = itertools.product(*zip(least[:2], most[:2], strict=True))
+    return np.array([(*side, least[2]) for side in sides])
 
-  def moved(self, shift: np.ndarray) -> '_Blocks':
-    """Returns the blocks, with a margin, `(3,)`, in m from this place."""
-    margin = np.array([_CLEARANCE, _CLEARANCE, 0.0])
-    starts, reach = (
-        [s.moved(shift)._replace(half=s.half + margin) for s in found]
-        for found in self
+  def moved(self, shift: Any, margin: float = 0.0) -> '_Blocks':
+    """Returns the blocks, with a margin in m, `(3,)`, in m from this place."""
+    return _Blocks(
+        *(
+            shapes._replace(
+                centres=shapes.centres + shift,
+                halves=shapes.halves + np.array([margin, margin, 0.0]),
+            )
+            for shapes in self
+        )
     )
-    return _Blocks(starts, reach)
 
 
 def place(
@@ -85,7 +84,10 @@ def place(
     mujoco.mj_kinematics(physics.model.ptr, physics.data.ptr)
     world = _World(physics, mechanism)
     blocks = {
-        name: _find_blocks(physics, register)
+        name: _Blocks(
+            clearance.initial_pose(physics, register, np.zeros(2)),
+            clearance.poses(physics, register, np.zeros(2)),
+        )
         for name, register in mechanism.registers.items()
     }
   # A register in a clear place does not make way for another one.
@@ -99,7 +101,7 @@ def place(
   for name in blocked:
     shift = world.nearest_clear_place(blocks[name])
     if shift is None:
-      x, y, _ = blocks[name].starts[0].centre
+      x, y, _ = blocks[name].start.centres[0]
       raise composer.EpisodeInitializationError(
           f'design {mechanism.design.name!r}: register {name!r} has no clear'
           f' place within {_FARTHEST:g} m of ({x:.3g}, {y:.3g}); place it'
@@ -137,21 +139,6 @@ def _unchanged(physics: mjcf.Physics) -> Iterator[None]:
       physics.mark_as_dirty()
 
 
-def _find_blocks(
-    physics: mjcf.Physics, register: registers.Register
-) -> _Blocks:
-  """Returns where the blocks of a register are, and can be written to.
-
-  Args:
-    physics: Physics; its state is changed.
-    register: The register.
-  """
-  still = np.zeros(2)
-  starts = solids.initial_regions(physics, register, still)
-  reach = solids.regions(physics, register, still)
-  return _Blocks([r.solid for r in starts], [r.solid for r in reach])
-
-
 @final
 class _World:
   """Everything solid in a world, except the registers that are to be placed."""
@@ -160,23 +147,24 @@ class _World:
       self, physics: mjcf.Physics, mechanism: mechanisms.FeedbackMechanism
   ) -> None:
     """Collects the geoms of a physics in its present state."""
-    model = physics.model
-    self._space = space = solids.Space(model.ptr)
+    self._space = space = clearance.Space(physics.model.ptr)
     is_other = np.ones_like(space.is_fixed)
-    is_other[list(solids.owners(physics, mechanism.registers))] = False
-    fixed = space.solids(physics, is_other & space.is_fixed)
-    movable = space.solids(physics, is_other & ~space.is_fixed)
-    self._fixed = solids.Crowd(space, fixed)
-    self._movable = solids.Crowd(space, movable)
-    is_plane = [model.geom_type[solid.geom] == _PLANE for solid in fixed]
-    self._is_plane = np.array(is_plane, bool)
-    tops = [solid.bounds[1, 2] for solid in fixed]
-    heights = [solid.centre[2] for solid in fixed]
-    self._tops = np.where(is_plane, heights, tops)
+    is_other[list(clearance.owners(physics, mechanism.registers))] = False
+    self._fixed = space.shapes(physics.data, is_other & space.is_fixed)
+    self._movable = space.shapes(physics.data, is_other & ~space.is_fixed)
+    # What registers may stand on.
+    self._is_plane = space.is_plane[self._fixed.geoms]
+    tops = self._fixed.bounds[1][:, 2]
+    self._tops = np.where(self._is_plane, self._fixed.centres[:, 2], tops)
+    size = physics.model.geom_size[self._fixed.geoms]
+    # A plane without a size has no end.
+    is_ended = self._is_plane[:, np.newaxis] & (size > 0.0)
+    halves = np.where(is_ended, size, self._fixed.halves)
+    self._carriers = self._fixed._replace(halves=halves).bounds
 
   def occupy(self, blocks: _Blocks) -> None:
     """Adds the blocks of a register as obstacles."""
-    self._fixed = self._fixed.joined(blocks.reach)
+    self._fixed = clearance.joined([self._fixed, blocks.reach])
 
   def is_clear(self, blocks: _Blocks) -> bool:
     """Returns True if a register can stay where it is. Planes are endless."""
@@ -190,27 +178,23 @@ class _World:
 
   def nearest_clear_place(self, blocks: _Blocks) -> np.ndarray | None:
     """Returns the shift to the nearest clear place, `(3,)`, in m, or `None`."""
-    step = float(blocks.starts[0].half.min())
+    step = float(blocks.start.halves.min())
     along = step * np.arange(-(_FARTHEST // step), _FARTHEST // step + 1)
     shifts = np.stack(np.meshgrid(along, along, 0.0), axis=-1).reshape(-1, 3)
     distance = np.linalg.norm(shifts, axis=1).round(6)
-    needs_ground, corners = self._is_below(blocks).any(), blocks.corners
     shifts = shifts[np.lexsort((*shifts.T, distance))]
-    with_margin = blocks.moved(np.zeros(3))
-    for i in range(0, len(shifts), _CHUNK):
-      some = shifts[i : i + _CHUNK]
-      # Most places are excluded for many at once.
-      if needs_ground:
-        some = some[self._space.may_carry(corners, some)]
-      for each in with_margin.reach:
-        some = some[~self._fixed.is_surely_met(each, some)]
-      for each in with_margin.starts:
-        some = some[~self._movable.is_surely_met(each, some)]
-      for shift in some:
-        if needs_ground and not self._is_carried(corners + shift):
-          continue
-        if self._is_free(blocks.moved(shift)):
-          return shift
+    needs_ground, corners = self._is_below(blocks).any(), blocks.corners
+    if needs_ground:
+      low, high = (bound[:, :2] for bound in self._carriers)
+      some = shifts[:, np.newaxis, :2]
+      is_within = corners[0, :2] + some >= low
+      is_within &= corners[-1, :2] + some <= high
+      shifts = shifts[is_within.all(axis=-1).any(axis=-1)]
+    for shift in shifts:
+      if needs_ground and not self._is_carried(corners + shift):
+        continue
+      if self._is_free(blocks.moved(shift, _CLEARANCE)):
+        return shift
     return None
 
   def _is_below(self, blocks: _Blocks) -> np.ndarray:
@@ -219,17 +203,17 @@ class _World:
     Surfaces above the floor are checked when a task is embedded.
     """
     bottom = blocks.corners[0, 2]
-    is_below = np.abs(self._tops - bottom) <= solids.GAP
-    return is_below & (bottom <= solids.GAP)
+    is_below = np.abs(self._tops - bottom) <= clearance.GAP
+    return is_below & (bottom <= clearance.GAP)
 
   def _is_carried(self, corners: np.ndarray) -> bool:
     """Returns True if one geom is under all corners of a register."""
-    above = corners + np.array([0.0, 0.0, solids.GAP])
-    return self._space.uncarried(above, 2 * solids.GAP) is None
+    above = corners + np.array([0.0, 0.0, clearance.GAP])
+    return self._space.uncarried(above, 2 * clearance.GAP) is None
 
   def _is_free(self, blocks: _Blocks) -> bool:
     """Returns True if no block can be inside something."""
     return not (
-        any(self._fixed.meeting(solid) for solid in blocks.reach)
-        or any(self._movable.meeting(solid) for solid in blocks.starts)
+        any(self._space.meetings(blocks.reach, self._fixed))
+        or any(self._space.meetings(blocks.start, self._movable))
     )

@@ -79,6 +79,14 @@ class ThinPhysics(mjcf.Physics):
     mujoco.mj_checkVel(*self._pointers)
     self._refuse_warnings()
 
+  @property
+  def state(self) -> np.ndarray:
+    """Integration state, `(size,)`."""
+    kind = mujoco.mjtState.mjSTATE_INTEGRATION
+    state = np.empty(mujoco.mj_stateSize(self._pointers[0], kind))
+    mujoco.mj_getState(*self._pointers, state, kind)
+    return state
+
   def mark_as_dirty(self) -> None:
     """Marks derived quantities as out of date."""
     self._dirty = self._has_old_poses = True

@@ -1,6 +1,5 @@
 """Contract of registers: what every kind of register promises."""
 
-import itertools
 from typing import Any, NamedTuple, final
 
 import numpy as np
@@ -64,8 +63,6 @@ def check_register(
     some block changes each reading. A port depends on its own blocks only, and
     the `direction` of a block raises a reading.
   - Nothing that happens to blocks changes the reading of a secure register.
-  - Writes put blocks nowhere but on the paths of the footprint, with the
-    headings of these paths.
   - A reset restores everything. A write to some worlds of a batch is the same
     as in these worlds alone, and changes no other world.
 
@@ -84,7 +81,6 @@ def check_register(
     _check_values(subject)
     _check_looks(subject)
     _check_shoves(subject)
-    _check_footprint(subject)
     if register.channel == 'embedded':
       _check_rest(subject)
       _check_displacements(subject)
@@ -416,67 +412,6 @@ def _displaced(
   place[:2] += displacement
   block.put(subject.physics, place, block.heading(subject.physics) + turn)
   return np.asarray(subject.read() - reading)
-
-
-def _check_footprint(subject: _Subject) -> None:
-  """Checks that values put the blocks on the paths of the footprint."""
-  register, physics = subject.register, subject.physics
-  where = subject.where
-  subject.world.restart()
-  paths = register.footprint(physics)
-  for value in _values_everywhere(register):
-    register.pose(physics, value)
-    for i, block in enumerate(register.blocks):
-      place = np.array(block.position(physics))
-      nearest = min(
-          (_distance(place, path) for path in paths if path.block == i),
-          default=np.inf,
-      )
-      heading = float(block.heading(physics))
-      contracts.require(
-          nearest <= _ROUNDING,
-          f'{where}: {value} puts block {i} {nearest} m beside the paths of its'
-          ' footprint; if a block depends on more than one port, override'
-          ' footprint',
-      )
-      contracts.require(
-          any(
-              _contains(place, heading, path)
-              for path in paths
-              if path.block == i
-          ),
-          f'{where}: {value} turns block {i} to {heading} rad, which is not'
-          ' among the headings of its footprint there; override footprint',
-      )
-
-
-def _values_everywhere(register: registers.Register) -> list[Any]:
-  """Returns values from the whole range, with ports also unequal ones."""
-  low, high = register.value_range
-  values: list[Any] = [*np.linspace(low, high, _NUM_VALUES)]
-  if shape := register.value_spec.shape:
-    ends = itertools.islice(itertools.product((low, high), repeat=shape[0]), 64)
-    values += [np.array(one) for one in ends]
-    values += [*np.random.default_rng(0).uniform(low, high, (32, *shape))]
-  return values
-
-
-def _contains(place: np.ndarray, heading: float, path: Any) -> bool:
-  """Returns whether a block has a heading on a path; see `_distance`."""
-  first, last = path.headings
-  middle, half = (first + last) / 2, abs(last - first) / 2
-  beside = abs(np.remainder(heading - middle + np.pi, 2 * np.pi) - np.pi)
-  is_near = _distance(place, path) <= _ROUNDING
-  return is_near and bool(beside <= half + _ROUNDING)
-
-
-def _distance(place: np.ndarray, path: Any) -> float:
-  """Returns the distance of a place from a path, in m."""
-  along = path.last - path.first
-  length = along @ along
-  share = (place - path.first) @ along / length if length else 0.0
-  nearest = path.first + np.clip(share, 0.0, 1.0) * along
-  return float(np.linalg.norm(place - nearest))
 
 
 def _check_batch(world: _World) -> None:

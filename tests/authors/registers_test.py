@@ -90,10 +90,6 @@ def _along_only(self, physics):
   return np.abs(wrong)[..., np.newaxis] * self._scale
 
 
-def _no_paths(self, physics):
-  return []
-
-
 def _constant(self, physics):
   return self._applied_slot.copy(physics)
 
@@ -111,18 +107,6 @@ def _turns(self, physics, value, where=None):
   self._blocks[0].put(physics, place, 0.1 * value, where)
 
 
-def _path_with(first, last):
-  def footprint(self, physics):
-    low, high = self.value_range
-    [start], [end] = (
-        self._places(physics, np.array(one)) for one in (low, high)
-    )
-    headings = first * low, last * high
-    return [registers.Path(0, start, end, self.value_range, headings)]
-
-  return footprint
-
-
 _BREACHES: dict[str, tuple[dict[str, Any], str]] = {
     'remembers': ({'_read_blocks': _remembers}, 'read as'),
     'ignores masks': ({'_put': _ignores_where}, 'to other worlds of a batch'),
@@ -136,15 +120,6 @@ _BREACHES: dict[str, tuple[dict[str, Any], str]] = {
     ),
     'sees motion along its axis only': (
         {'displacements': _along_only}, 'displacements reports 0.0 m'
-    ),
-    'has no paths': ({'footprint': _no_paths}, 'the paths of its footprint'),
-    'turns without headings': (
-        {'_put': _turns, 'footprint': _path_with(0.0, 0.0)},
-        '-2.0 turns block 0 to -0.',
-    ),
-    'turns farther than its headings': (
-        {'_put': _turns, 'footprint': _path_with(0.1, 0.09)},
-        'not among the headings of its footprint',
     ),
     'has a direction that lowers it': (
         {'_TO': (-1.0, 0.0)}, 'the direction of a block raises a reading'
@@ -165,33 +140,8 @@ def test_a_simple_kind_keeps_the_contract():
   testing.check_register(_Counting)
 
 
-@pytest.mark.parametrize('turns', [0, 3])
-def test_a_kind_that_turns_as_it_moves_keeps_the_contract(turns: int):
-  # Whole turns are the same headings.
-  def footprint(self, physics):
-    [path] = _path_with(0.1, 0.1)(self, physics)
-    first, last = (h + 2 * np.pi * turns for h in path.headings)
-    return [path._replace(headings=(first, last))]
-
-  kind: Any = type(
-      'Turning', (_Counting,), {'_put': _turns, 'footprint': footprint}
-  )
-  testing.check_register(kind)
-
-
-def test_a_kind_may_turn_back_and_forth_along_its_path():
-  # One path, with all headings, from one end to the other.
-  def turns(self, physics, value, where=None):
-    [place] = self._places(physics, value)
-    heading = 0.4 * np.sin(9.0 * value)
-    self._blocks[0].put(physics, place, heading, where)
-
-  def footprint(self, physics):
-    [path] = _path_with(0.0, 0.0)(self, physics)
-    return [path._replace(headings=(-0.4, 0.4))]
-
-  members = {'_put': turns, 'footprint': footprint}
-  testing.check_register(type('Swinging', (_Counting,), members))
+def test_a_kind_that_turns_as_it_moves_keeps_the_contract():
+  testing.check_register(type('Turning', (_Counting,), {'_put': _turns}))
 
 
 @pytest.mark.parametrize('breach', _BREACHES)
@@ -221,38 +171,6 @@ def test_blocks_that_push_each_other_are_noticed():
     testing.check_register(_Crowded)
 
 
-class _Rod(registers.Register):
-  """Has beads that depend on both of its ports, and no footprint."""
-
-  PORTS = 'middle', 'gap'
-
-  def _build_blocks(self):
-    return [
-        self._add_block(name, 'offset_block', (0.0, y))
-        for name, y in (('left', 0.0), ('right', 0.25))
-    ]
-
-  def _places(self, physics, value):
-    places = []
-    for y, sign in ((0.0, -1.0), (0.25, 1.0)):
-      place = np.array(self._origin(physics))
-      along = value[..., 0] + sign * value[..., 1] / 2
-      places.append(place + self._scale * along * np.eye(3)[0])
-      places[-1][..., 1] += y
-    return places
-
-  def _read_blocks(self, physics):
-    start = self._origin(physics)[..., 0]
-    left, right = (block.along(physics) - start for block in self._blocks)
-    both = [(left + right) / 2, right - left]
-    return np.stack(both, axis=-1) / self._scale
-
-
-def test_a_footprint_that_no_port_alone_reaches_is_noticed():
-  with pytest.raises(testing.ContractError, match='more than one port'):
-    testing.check_register(_Rod)
-
-
 def test_positions_are_relative_to_the_start():
   def reads_anywhere(self, physics):
     return self._blocks[0].along(physics) / self._scale
@@ -277,11 +195,6 @@ class _Turning(_Counting):
   def _read_blocks(self, physics):
     turned = self._blocks[0].heading(physics) - self._least
     return ((turned + 1e-12) % (2 * np.pi) + self._least - 1e-12) / self._scale
-
-  def footprint(self, physics):
-    [place] = self._places(physics, np.array(0.0))
-    headings = self._low * self._scale, self._high * self._scale
-    return [registers.Path(0, place, place, self.value_range, headings)]
 
   def displacements(self, physics):
     wrong = self._read_blocks(physics) - self.applied(physics)

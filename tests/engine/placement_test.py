@@ -7,7 +7,7 @@ import pytest
 
 from realab_suite import errors
 from realab_suite import suite
-from realab_suite.engine import solids
+from realab_suite.engine import clearance
 from realab_suite.entities import arenas
 from realab_suite.entities import moving
 from realab_suite.entities import registers
@@ -165,8 +165,8 @@ def test_accepted_rooms_have_no_overlap(room):
     hypothesis.event(f'refused: {str(error).split()[0]}')
     return
   hypothesis.event('accepted')
-  assert built.deepest(100) <= solids.TOLERANCE
-  assert built.deepest_start(5) <= solids.TOLERANCE
+  assert built.deepest(100) <= clearance.TOLERANCE
+  assert built.deepest_start(5) <= clearance.TOLERANCE
   built.env.close()
 
 
@@ -341,6 +341,43 @@ def test_a_block_that_goes_in_circles_is_followed(range_, post, is_refused):
     task = _room_with(_post(post))
     assert is_refused == _is_refused(
         task, [0.0, 2.0], kind='test_circling', range=list(range_)
+    )
+
+
+class _Rod(registers.Register):
+  """Has beads that depend on both of its ports."""
+
+  PORTS = 'middle', 'gap'
+
+  def _build_blocks(self):
+    return [
+        self._add_block(name, 'offset_block', (0.0, y))
+        for name, y in (('left', 0.0), ('right', 0.25))
+    ]
+
+  def _places(self, physics, value):
+    places = []
+    for y, sign in ((0.0, -1.0), (0.25, 1.0)):
+      place = np.array(self._origin(physics))
+      along = value[..., 0] + sign * value[..., 1] / 2
+      places.append(place + self._scale * along * np.eye(3)[0])
+      places[-1][..., 1] += y
+    return places
+
+  def _read_blocks(self, physics):
+    start = self._origin(physics)[..., 0]
+    left, right = (block.along(physics) - start for block in self._blocks)
+    both = [(left + right) / 2, right - left]
+    return np.stack(both, axis=-1) / self._scale
+
+
+@pytest.mark.parametrize(('x', 'is_refused'), [(-0.4, True), (-0.8, False)])
+def test_ports_are_posed_with_unequal_values(x, is_refused):
+  # The left bead is 0.3 m beside the start if its ports have -1 and 4.
+  with helpers.registered(register_kinds.REGISTER_KINDS, 'test_rod', _Rod):
+    task = _room_with(_post((x, 2.0)))
+    assert is_refused == _is_refused(
+        task, [0.0, 2.0], kind='test_rod', range=[-1, 4]
     )
 
 

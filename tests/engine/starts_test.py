@@ -9,7 +9,7 @@ import pytest
 
 from realab_suite import errors
 from realab_suite import suite
-from realab_suite.engine import starts
+from realab_suite.engine import placement
 from realab_suite.entities import moving
 from realab_suite.entities import rotations
 from realab_suite.tasks import collect_apples
@@ -205,7 +205,7 @@ _ASIDE, _INSIDE = (-2.0, 2.0), (0.25, 2.0)
 def test_a_register_in_a_body_of_the_task_is_refused():
   with pytest.raises(
       errors.SpecError,
-      match=r"register 'r' would be at .* inside 'crate' when an episode",
+      match=r"register 'r' at value 0 would be at .* inside 'crate' when an",
   ):
     suite.embed(_Crated(_INSIDE, _ASIDE), _design(), random=0)
   assert "inside 'crate' when the" in _problem(_Crated(_ASIDE, _INSIDE))
@@ -219,6 +219,6 @@ def test_worlds_whose_parts_stay_pay_nothing(monkeypatch: Any):
   def refuse(*args: Any) -> None:
     raise AssertionError('a distance was measured')
 
-  monkeypatch.setattr(starts.StartCheck, '_refuse', refuse)
+  monkeypatch.setattr(placement.StartCheck, '_refuse', refuse)
   env.reset()
   env.close()

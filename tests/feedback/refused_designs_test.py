@@ -112,10 +112,10 @@ _DOES_NOT_FIT = {
         "design 'd': meters[0].measures: 'scor' cannot be measured in this"
         " world; did you mean 'score'?; allowed are ['score']",
     'registers.reward.place=[0, 0] & registers.reward.range=[0, 200]':
-        "register 'reward' at value 200 would be at (20, 0.25), outside the"
-        ' arena (-4, -4) to (4, 4)',
+        "register 'reward' at value 40.625 would be at (4.06, 0.25), outside"
+        ' the arena (-4, -4) to (4, 4)',
     'registers.reward.place=[9, 0]':
-        "register 'reward' at values -2 to 12 would be at (9, 0), outside the"
+        "register 'reward' at value -2 would be at (9, 0), outside the"
         ' arena',
     'registers.reward.place=[0, 3.7] & registers.reward.range=[0, 1]':
         "inside 'wall_north'; place it elsewhere or narrow its range",

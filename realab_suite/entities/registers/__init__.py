@@ -13,7 +13,6 @@ from realab_suite.entities.registers.block_orientation import (
     BlockOrientationRegister,
 )
 from realab_suite.entities.registers.block_position import BlockPositionRegister
-from realab_suite.entities.registers.footprints import Path
 from realab_suite.entities.registers.records import AGENT
 from realab_suite.entities.registers.records import EVALUATOR
 from realab_suite.entities.registers.records import INITIAL

@@ -10,7 +10,6 @@ from realab_suite.entities import axes
 from realab_suite.entities import block_kinds
 from realab_suite.entities import protocols
 from realab_suite.entities.registers import base
-from realab_suite.entities.registers import footprints
 from realab_suite.entities.registers import moves
 
 # Distance between neighbouring rods in m, beside the size of a block.
@@ -100,16 +99,6 @@ class Abacus(base.Register):
     started = self._origin(physics).T[0]
     moved = (started - self._blocks[0].along(physics)) / self._scale
     return np.stack([moved] * len(self.PORTS), axis=-1)
-
-  def footprint(self, physics: protocols.Physics) -> list[footprints.Path]:
-    ends = [
-        self._places(physics, np.full(len(self.PORTS), value))
-        for value in self.value_range
-    ]
-    return [
-        footprints.Path(i, np.array(start), np.array(end), self.value_range)
-        for i, (start, end) in enumerate(zip(*ends, strict=True))
-    ]
 
 
 @final

@@ -22,7 +22,6 @@ from realab_suite.entities import protocols
 from realab_suite.entities import state
 from realab_suite.entities.registers import arguments as register_arguments
 from realab_suite.entities.registers import checks
-from realab_suite.entities.registers import footprints
 from realab_suite.entities.registers import kinds
 from realab_suite.entities.registers import records
 
@@ -133,32 +132,6 @@ class Register(kinds.Kind):
   def own_blocks(self) -> list[block_kinds.Block]:
     """Blocks that are no blocks of the world."""
     return [block for block in self._blocks if block is not self._borrowed]
-
-  def footprint(self, physics: protocols.Physics) -> list[footprints.Path]:
-    """Returns where writes put the blocks in this episode, if undisturbed.
-
-    Worlds in which something that nothing can push, or another register, is in
-    the way of a path are refused. The paths must contain the poses of all
-    values of the range, and lines of sight if the kind looks along some.
-
-    This base class tries 257 values. A kind whose blocks jump, or move to and
-    fro between two of these values, has to override this method; a kind whose
-    blocks move along a line overrides it to be loaded faster. With ports,
-    all of them get the same value, so a kind with a block that depends on more
-    than one port has to override it, too.
-
-    Args:
-      physics: One world; the blocks are moved.
-    """
-    return footprints.sampled(
-        physics,
-        self._blocks,
-        self.value_range,
-        lambda value: self.pose(physics, value),
-    )
-
-  def check_sight(self, physics: protocols.Physics) -> None:
-    """Refuses blocks that are not seen as they are placed, and moves them."""
 
   @property
   def spread(self) -> np.ndarray:

@@ -9,7 +9,6 @@ from realab_suite.entities import axes
 from realab_suite.entities import block_kinds
 from realab_suite.entities import protocols
 from realab_suite.entities.registers import base
-from realab_suite.entities.registers import footprints
 from realab_suite.entities.registers import moves
 
 # Largest heading that represents a value, in rad. Headings are equal modulo a
@@ -65,11 +64,6 @@ class BlockOrientationRegister(base.Register):
 
   def _read_blocks(self, physics: protocols.Physics) -> np.ndarray:
     return self._block.heading(physics) / self._scale
-
-  def footprint(self, physics: protocols.Physics) -> list[footprints.Path]:
-    centre = np.array(self._origin(physics))
-    first, last = (value * self._scale for value in self.value_range)
-    return [footprints.Path(0, centre, centre, self.value_range, (first, last))]
 
   def displacements(self, physics: protocols.Physics) -> np.ndarray:
     turned = self._block.heading(physics) - self.applied(physics) * self._scale

@@ -8,7 +8,6 @@ from realab_suite.entities import axes
 from realab_suite.entities import block_kinds
 from realab_suite.entities import protocols
 from realab_suite.entities.registers import base
-from realab_suite.entities.registers import footprints
 from realab_suite.entities.registers import moves
 
 
@@ -46,9 +45,3 @@ class BlockPositionRegister(base.Register):
   def _read_blocks(self, physics: protocols.Physics) -> np.ndarray:
     started = self._origin(physics).T[0]
     return (self._block.along(physics) - started) / self._scale
-
-  def footprint(self, physics: protocols.Physics) -> list[footprints.Path]:
-    [first], [last] = (
-        self._places(physics, np.array(value)) for value in self.value_range
-    )
-    return [footprints.Path(0, first, last, self.value_range)]

@@ -9,7 +9,6 @@ from realab_suite.entities import axes
 from realab_suite.entities import block_kinds
 from realab_suite.entities import protocols
 from realab_suite.entities.registers import base
-from realab_suite.entities.registers import footprints
 from realab_suite.entities.registers import moves
 
 # Gap between the paths of the two blocks, in m, so that both blocks are visible
@@ -99,12 +98,3 @@ class TwoBlockRegister(base.Register):
   def _permanent(self, physics: protocols.Physics) -> np.ndarray:
     started = self._origin(physics).T[0]
     return (started - self._base.along(physics)) / self._scale
-
-  def footprint(self, physics: protocols.Physics) -> list[footprints.Path]:
-    first, last = (
-        self._places(physics, np.array(value)) for value in self.value_range
-    )
-    return [
-        footprints.Path(i, np.array(start), np.array(end), self.value_range)
-        for i, (start, end) in enumerate(zip(first, last, strict=True))
-    ]
