@@ -185,12 +185,6 @@ class Display(registers.Register):
     unhidden = self.read_without(physics, lambda geoms: geoms >= 0)
     return np.where(moved, unhidden - applied, 0.0)
 
-  def footprint(self, physics):
-    # A raised row needs the room of a base block that moves to its end.
-    [start] = self._places(physics, 0.0)
-    end = start + np.array([self._end, 0.0, self.blocks[0].half_size])
-    return [registers.Path(0, start, end, (self.value_range[0],) * 2)]
-
 
 def main() -> None:
   """Pays an agent by a display, and stands in front of it."""

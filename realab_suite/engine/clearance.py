@@ -243,15 +243,20 @@ def _shapes(
 def owners(
     physics: Any, named: Mapping[str, registers.Register]
 ) -> dict[int, str]:
-  """Returns the names of registers by the geoms of the bodies of blocks."""
-  bodies = physics.model.geom_bodyid
-  return {
-      geom: name
+  """Returns the names of registers by the geoms that move with their blocks."""
+  parents, bodies = physics.model.body_parentid, physics.model.geom_bodyid
+  owner_of_body = {
+      int(bodies[physics.bind(block.geom).element_id]): name
       for name, register in named.items()
       for block in register.blocks
-      for geom in np.flatnonzero(
-          bodies == bodies[physics.bind(block.geom).element_id]
-      ).tolist()
+  }
+  for body, parent in enumerate(parents):  # Parents come first.
+    if int(parent) in owner_of_body:
+      owner_of_body.setdefault(body, owner_of_body[int(parent)])
+  return {
+      geom: owner_of_body[int(body)]
+      for geom, body in enumerate(bodies)
+      if int(body) in owner_of_body
   }
 
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from realab_suite.engine import clearance
 from realab_suite.entities import registers
-from realab_suite.entities import surroundings
+from realab_suite.entities import rotations
 from realab_suite.feedback import mechanisms
 
 # Largest distance along each axis by which a register is moved, in m.
@@ -118,7 +118,7 @@ def _move(
 ) -> None:
   """Moves a register in the plane of the floor, `(3,)`, in m."""
   frame = physics.bind(mjcf.get_attachment_frame(register.mjcf_model))
-  rotation = surroundings.matrix(physics.model.body_quat[frame.element_id])
+  rotation = rotations.matrices(physics.model.body_quat[frame.element_id])
   displacement = (shift @ rotation)[:2]
   if shift.any():
     register.settle(physics, displacement)

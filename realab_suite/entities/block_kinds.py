@@ -243,7 +243,7 @@ class Block(abc.ABC):
     position = self.position(physics)
     is_far = self._surroundings.are_far(physics, position)
     if not axes.everywhere(is_far):
-      along = self._free(physics, position, along, is_far)
+      along = self._free(position, along, self.orientation(physics), is_far)
     position[..., 0] = along
     moved = position[..., :1] - self._rest[:1]
     axes.assign(physics.bind(self._slides[0]), 'qpos', moved, where)
@@ -284,28 +284,26 @@ class Block(abc.ABC):
 
   def _free(
       self,
-      physics: protocols.Physics,
       position: np.ndarray,
       along: np.ndarray,
+      orientation: np.ndarray,
       is_far: Any,
   ) -> np.ndarray:
     """Returns the free x coordinates nearest to wanted ones, `(...)`, in m.
 
     Args:
-      physics: One world or a batch of worlds.
       position: Present position in the register's frame, `(..., 3)`, in m.
       along: Wanted x coordinate, `(...)`, in m.
+      orientation: Orientation, `(..., 4)`.
       is_far: True where no obstacle is near, `(...)` bool.
     """
     free = np.array(np.broadcast_to(along, position.shape[:-1]))
-    orientation = self.orientation(physics)
     for world in np.argwhere(~np.asarray(is_far)):
       index = tuple(world)
       free[index] = self._surroundings.nearest_free(
-          physics,
           index,
           np.array([free[index], *position[index][1:]]),
-          surroundings.matrix(orientation[index]),
+          rotations.matrices(orientation[index]),
           float(position[index][0]),
       )
     return free[()]

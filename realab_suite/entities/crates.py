@@ -103,7 +103,7 @@ class Crate(measurables.MeasurableEntity):
     x, y = (float(number) for number in position)
     along, across = (float(number) for number in spread)
     root.attach(self).pos = (x, y, 0.0)
-    self._block.surroundings.limit(-along, along, across)
+    self._block.surroundings.limit(-along, along)
     self._place = arenas.Place(
         (x, y), spread=(along, across), block=self._block
     )

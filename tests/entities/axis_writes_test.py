@@ -9,7 +9,6 @@ import pytest
 
 from realab_suite.entities import arenas
 from realab_suite.entities import registers
-from realab_suite.entities import surroundings
 from tests import worlds
 from tests.entities import avatar_worlds
 from tests.entities import register_worlds
@@ -252,7 +251,12 @@ def test_obstacles_include_what_the_task_adds():
   block.put(physics, [0.0, 1.0, block.rest_height])
   register.write(physics, 20.5)
   assert float(register.inspect(physics).obstruction) > 1.0
-  assert len(surroundings.boxes_of(physics.model, 0).centres) >= 9
+  # A cylinder is round: beside it, the corners of the box around it are free.
+  for value, is_obstructed in ((21.0, True), (22.5, False)):
+    block.put(physics, [0.0, 1.33, block.rest_height])
+    register.write(physics, value)
+    obstruction = float(register.inspect(physics).obstruction)
+    assert (obstruction != 0.0) == is_obstructed
 
 
 def test_a_secure_register_is_never_obstructed():

@@ -190,7 +190,7 @@ class Register(kinds.Kind):
     reach = np.array([self._low, self._high]) * self._scale
     low, high = reach[0] - spread[0], reach[1] + spread[0]
     for own_block in self._blocks:
-      own_block.surroundings.limit(low, high, spread[1])
+      own_block.surroundings.limit(low, high)
       if isinstance(own_block, block_kinds.PlanarBlock):
         own_block.stand_at(height)
     if block is not None:
