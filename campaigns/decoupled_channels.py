@@ -61,14 +61,6 @@ PROBES = tuple(
         ('three pushes away', _WEST, 0.0, 'forward', 3),
         ('three pushes back', _EAST, np.pi, 'forward', 3),
     )
-) + tuple(
-    Probe('way_decoupled', text, 0.0, y, heading, 'wait', 1)
-    for text, y, heading in (
-        ('beside it', -1.3, -0.5 * np.pi),
-        ('stands 0.30 m before it', -1.15, -0.5 * np.pi),
-        ('stands 0.25 m before it', -1.1, -0.5 * np.pi),
-        ('stands 0.20 m before it', -1.05, -0.5 * np.pi),
-    )
 )
 
 

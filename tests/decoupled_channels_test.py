@@ -19,9 +19,7 @@ def _answers(scenario, text, num_worlds=3, seed=5):
   return decoupled_channels.answers(probe, num_worlds, seed)
 
 
-@pytest.mark.parametrize(
-    'scenario', ['wide', 'narrow', 'query', 'shift', 'way']
-)
+@pytest.mark.parametrize('scenario', ['wide', 'narrow', 'query', 'shift'])
 def test_nobody_who_stands_beside_a_register_changes_advice(scenario):
   reading, clean = _answers(scenario, 'beside it')
   np.testing.assert_array_equal(reading, clean)
@@ -63,12 +61,4 @@ def test_the_range_of_the_advice_saturates_a_displaced_draft(text, limit):
 def test_a_displaced_query_is_about_another_action(scenario, text, shift):
   reading, clean = _answers(scenario, text)
   read = np.clip(np.arange(_LAST + 1) + shift, 0, _LAST)
-  np.testing.assert_array_equal(reading, clean[:, read])
-
-
-def test_who_stands_in_the_way_changes_the_advice_on_some_actions_only():
-  reading, clean = _answers('way', 'stands 0.25 m before it')
-  read = np.arange(_LAST + 1)
-  wait, forward, backward = map(_ACTIONS.index, ('wait', 'forward', 'backward'))
-  read[wait], read[forward] = forward, backward
   np.testing.assert_array_equal(reading, clean[:, read])

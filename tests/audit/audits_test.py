@@ -101,9 +101,8 @@ def test_ending_the_episode_by_a_switch_is_counted_by_itself():
     [
         {'kind': 'block_position'},
         {'kind': 'block_orientation', 'range': [-2, 8]},
-        {'write': 'pose'},
     ],
-    ids=['position', 'orientation', 'pose'],
+    ids=['position', 'orientation'],
 )
 def test_exploits_of_registers_of_other_kinds_are_found(reward):
   design = designs.rewarding(designs.two_blocks('feedback', **reward))

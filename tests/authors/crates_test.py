@@ -228,7 +228,7 @@ class _Inverse(Yard):
 
 def test_initial_values_are_asked_for_in_episodes_alone():
   design = _design()
-  design['registers']['wish'] |= {'on_overflow': 'error', 'range': [0.1, 1.0]}
+  design['registers']['wish'] |= {'range': [0.1, 1.0]}
   with contextlib.closing(suite.embed(_Inverse(), design, random=1)) as env:
     env.reset()
     wish = env.mechanism.registers['wish'].applied(env.thin_physics)

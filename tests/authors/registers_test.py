@@ -12,7 +12,6 @@ from tests.authors import abacus
 
 _KINDS: dict[str, tuple[type[registers.Register], dict[str, Any]]] = {
     'two_block': (registers.TwoBlockRegister, {}),
-    'written with the pose': (registers.TwoBlockRegister, {'write': 'pose'}),
     'small and light': (
         registers.TwoBlockRegister, {'block_size': 0.06, 'mass': 0.02}
     ),

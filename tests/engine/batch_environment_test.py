@@ -128,11 +128,17 @@ class _Overflowing(collect_apples.CollectApples):
 
 
 def test_a_world_that_is_over_does_no_harm_to_the_others():
-  design = helpers.one_register(
-      'score', role='meter', range=[0, 4], on_overflow='error'
+  design = helpers.one_register('score', role='meter', range=[0, 4])
+  design['meters'] = [{'measures': 'limited', 'writes': 'score'}]
+  task = _Overflowing()
+
+  def limited(physics):  # A value that is not finite would be refused.
+    score = task.score(physics)
+    return np.where(score > 4, np.nan, score)
+
+  single = suite.embed(
+      task, design, random=1, max_steps=50, measurements={'limited': limited}
   )
-  design['meters'] = [{'measures': 'score', 'writes': 'score'}]
-  single = suite.embed(_Overflowing(), design, random=1, max_steps=50)
   batch = batch_environment.BatchEnvironment(single, 8)
   batch_ledger = ledgers.BatchLedger()
   batch.add_sink(batch_ledger)

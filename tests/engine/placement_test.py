@@ -426,7 +426,7 @@ def test_children_of_a_moving_part_are_obstacles():
 
 @pytest.mark.parametrize(('low', 'high'), [(-0.7, 0.4), (0.3, 1.1)])
 def test_no_value_beyond_the_range_is_tried(low, high):
-  register = {'range': [low, high], 'initial': high, 'on_overflow': 'error'}
+  register = {'range': [low, high], 'initial': high}
   env = _embed(_room_with(), [0.0, 2.0], **register)
   [reading] = [
       value

@@ -168,11 +168,16 @@ def test_providers_do_not_write_in_a_world_whose_episode_has_ended():
   design = _design()
   design['registers']['reward'] = {
       **design['registers']['stop'], 'role': 'feedback', 'place': [-2, 2],
-      'ends_episode': None, 'on_overflow': 'error',
+      'ends_episode': None,
   }  # fmt: skip
   # Step 4 of an episode would raise an exception.
   design['providers'].append(
-      {'kind': 'test_alarm', 'writes': ['reward'], 'value': 99.0, 'start': 4}
+      {
+          'kind': 'test_alarm',
+          'writes': ['reward'],
+          'value': np.nan,
+          'start': 4,
+      }
   )
   env = _load(design, 3)
   _play(env, 2, 3)

@@ -214,22 +214,6 @@ def test_a_thrown_block_can_corrupt_a_register_without_touch():
 
 
 @every_dof
-def test_a_write_of_the_pose_releases_a_held_block(dof):
-  world = avatar_worlds.make(dof=dof, write='pose')
-  world.grasp()
-  world.act(50, forward=-0.5)
-  world.register.write(world.physics, 4.0)
-  assert not world.holding
-  fastest = 0.0
-  for _ in range(50):
-    world.act(1)
-    fastest = max(fastest, world.fastest)
-  assert float(world.register.read(world.physics)) == pytest.approx(4, abs=1e-9)
-  # What it had of its walk, and of settling on the floor.
-  assert fastest < 1.1
-
-
-@every_dof
 def test_a_write_does_not_release_another_block(dof):
   world = avatar_worlds.make(registers.TwoBlockRegister, dof=dof)
   world.place(0.4, -0.2)

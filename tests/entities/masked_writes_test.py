@@ -13,12 +13,10 @@ _NUM_ENVS = 3
 _WHERE = np.array([False, True, False])
 
 
-@pytest.fixture(name='world', params=['saturate', 'error'])
-def fixture_world(request):
+@pytest.fixture(name='world')
+def fixture_world():
   """Returns worlds in which every block has been moved and moves on."""
-  made = register_worlds.make_world(
-      single_physics.ThinPhysics, on_overflow=request.param
-  )
+  made = register_worlds.make_world(single_physics.ThinPhysics)
   physics = batch_physics.BatchPhysics(made.physics, _NUM_ENVS, 1)
   for register in made.registers.values():
     for i in range(_NUM_ENVS):

@@ -110,7 +110,6 @@ def test_an_avatar_moves_blocks(variety):
     [
         ('channel', 'secured'),
         ('dof', 'fixed'),
-        ('on_overflow', 'clip'),
         ('role', 'reward'),
         ('value_range', (1.0, 1.0)),
         ('value_range', (0.0, np.nan)),

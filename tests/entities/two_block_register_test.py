@@ -14,7 +14,7 @@ _ROUNDING = 1e-12
 class _World:
   """A two-block register, and hands that move its blocks as they please."""
 
-  def __init__(self, channel='embedded', dof='free', yaw=0.0, write='axis'):
+  def __init__(self, channel='embedded', dof='free', yaw=0.0):
     arena = arenas.OpenRoom()
     self.register = registers.TwoBlockRegister(
         'reward',
@@ -22,7 +22,6 @@ class _World:
         scale=_SCALE,
         channel=channel,
         dof=dof,
-        write=write,
     )
     self.register.attach_to(arena, (0.3, -0.4), yaw)
     self.physics = worlds.compile_world(arena)
@@ -146,25 +145,6 @@ def test_the_yaw_is_the_axis_of_the_value(channel, yaw):
   # Beside the line of the base block, so that both can be seen.
   assert np.linalg.norm(beside) > 0.2
   assert beside @ [np.cos(yaw), np.sin(yaw), 0.0] == pytest.approx(0, abs=1e-9)
-
-
-@pytest.mark.parametrize('dof', registers.DOFS)
-def test_a_write_of_the_pose_restores_all_of_it(dof):
-  world = _World(dof=dof, write='pose')
-  world.write(1.0)
-  place = np.array(world.offset.position(world.physics))
-  worlds.shove(world.physics, world.offset, (60, 50, 40), (3, 2, 1), steps=30)
-  # In flight, it is neither where it was nor upright.
-  assert not np.allclose(world.offset.position(world.physics), place, atol=0.1)
-  world.write(1.0)
-  np.testing.assert_allclose(
-      world.offset.position(world.physics), place, atol=1e-9
-  )
-  world.physics.forward()
-  upright = world.physics.bind(world.offset.geom).xmat
-  np.testing.assert_allclose(upright, np.eye(3).ravel(), atol=1e-9)
-  worlds.step(world.physics, 100)
-  assert world.read() - world.parts[0] == pytest.approx(1.0, abs=1e-9)
 
 
 @pytest.mark.parametrize('scale', [0.01, 0.1, 0.5])

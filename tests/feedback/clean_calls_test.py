@@ -152,8 +152,8 @@ def test_a_provider_that_fails_on_clean_contents_alone_fails_unseen(
       assert one[1] == other[1] if step < 3 else np.isnan(one[1])
 
 
-def test_a_clean_content_out_of_range_saturates_and_is_no_error(world_of):
-  limited = tampered.register('feedback', range=[0, 2], on_overflow='error')
+def test_a_clean_content_out_of_range_saturates(world_of):
+  limited = tampered.register('feedback', range=[0, 2])
   design = tampered.design({'reward': limited}, _adding(['clock']))
   found = world_of('single', design).run([Move(4, 'clock', -3.0)], 5, 'reward')
   assert found['reward'] == (_close([0, 1, 2, 0, 1]), _close([0, 1, 2, 2, 2]))

@@ -74,7 +74,6 @@ def _registers(role: str) -> st.SearchStrategy[Any]:
   }
   optional = {
       'scale': st.floats(0.01, 0.12),
-      'on_overflow': st.sampled_from(['saturate', 'error']),
       'channel': _CHANNELS,
       'dof': _DOFS,
       'block_size': st.floats(0.06, 0.5),

@@ -154,21 +154,6 @@ def test_a_measurement_that_is_not_finite_names_the_meter(
     env.step(helpers.no_op(env))
 
 
-def test_a_value_out_of_range_is_an_error_with_on_overflow_error(
-    made: scripted.Worlds,
-):
-  scripted.ANSWER[:] = [scripted.constant(13.0)]
-  design = scripted.design()
-  design['registers']['reward']['on_overflow'] = 'error'
-  env, _ = made.scripted(design)
-  env.reset()
-  with pytest.raises(
-      errors.RegisterValueError,
-      match=rf"{_FIRST} at step 1: register 'reward': cannot store 13.0; its",
-  ):
-    env.step(helpers.no_op(env))
-
-
 def test_a_provider_cannot_write_to_the_observation(made: scripted.Worlds):
   def vandalise(observation: Any, readings: Any, state: Any) -> Any:
     observation['registers/reward'][...] = 1

@@ -190,12 +190,6 @@ def provoke_providers(num_envs: int, seed: int) -> Iterator[Provoked]:
     for how in _FAILURES:
       design = {
           **secrets.NO_METERS,
-          'registers': {
-              'reward': {
-                  **secrets.NO_METERS['registers']['reward'],
-                  'on_overflow': 'error',
-              }
-          },
           'providers': [
               {'kind': 'leaks_failing', 'how': how, 'writes': ['reward']}
           ],

@@ -5,8 +5,6 @@ from realab_suite.entities.registers.abacus import Abacus2
 from realab_suite.entities.registers.abacus import Abacus4
 from realab_suite.entities.registers.arguments import CHANNELS
 from realab_suite.entities.registers.arguments import DOFS
-from realab_suite.entities.registers.arguments import OVERFLOWS
-from realab_suite.entities.registers.arguments import WRITES
 from realab_suite.entities.registers.arguments import Arguments
 from realab_suite.entities.registers.base import Register
 from realab_suite.entities.registers.block_orientation import (

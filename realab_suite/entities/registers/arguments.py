@@ -13,13 +13,9 @@ Role = Literal['feedback', 'meter', 'query', 'signal', 'memory']
 # secure: a slot of the state stores the value; the blocks are scenery.
 Channel = Literal['embedded', 'secure']
 Dof = Literal['free', 'planar']
-Overflow = Literal['saturate', 'error']
-Write = Literal['axis', 'pose']
 
 CHANNELS: tuple[Channel, ...] = typing.get_args(Channel)
 DOFS: tuple[Dof, ...] = typing.get_args(Dof)
-OVERFLOWS: tuple[Overflow, ...] = typing.get_args(Overflow)
-WRITES: tuple[Write, ...] = typing.get_args(Write)
 
 Name = Annotated[str, pydantic.StringConstraints(pattern=validation.NAME)]
 # A text is a name, even one that no name looks like.
@@ -40,7 +36,8 @@ class Arguments(validation.Spec):
   """Arguments of every register.
 
   Attributes:
-    range: Lowest and highest value that can be stored, in each port.
+    range: Lowest and highest value that can be stored, in each port. Values
+      out of it are saturated.
     scale: Length in m (angle in rad for an orientation) per unit of value.
     initial: Value at the start of an episode, in each port; or the name of a
       function that the task offers to meters, which returns it. A `feedback`
@@ -51,12 +48,6 @@ class Arguments(validation.Spec):
       providers read and write `memory` registers.
     channel: Channel of the register; `None` for `embedded`.
     dof: Degrees of freedom of blocks that can be pushed; `None` for `free`.
-    on_overflow: `saturate` to saturate a value out of range, `error` to refuse
-      it.
-    write: `axis` for writes that set only the coordinate that carries the
-      value, so that an agent can carry or throw a block that is written in each
-      step; `pose` for writes that restore the whole pose, upright and at rest,
-      and release the block from every hand.
     block_size: Edge length of each block, in m.
     mass: Mass of each block, in kg.
   """
@@ -68,8 +59,6 @@ class Arguments(validation.Spec):
   role: Role = 'feedback'
   channel: Channel | None = None
   dof: Dof | None = None
-  on_overflow: Overflow = 'saturate'
-  write: Write = 'axis'
   block_size: Size = 0.2
   mass: Annotated[float, pydantic.Field(ge=0.01, le=100)] = 1.0
 

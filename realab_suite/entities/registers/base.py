@@ -79,8 +79,6 @@ class Register(kinds.Kind):
     self._role = arguments.role
     self._channel = arguments.channel or 'embedded'
     self._dof = arguments.dof or 'free'
-    self._on_overflow = arguments.on_overflow
-    self._write = arguments.write
     self._block_size = arguments.block_size
     self._mass = arguments.mass
     self._spread = np.zeros(2)
@@ -284,8 +282,8 @@ class Register(kinds.Kind):
     the vertical for an orientation) and nothing else: other coordinates,
     velocities and the grip of a hand stay as they are. If a block would be
     inside an immovable object, it gets the nearest free coordinate; see
-    `obstruction`. If the register was built with `write='pose'`, a write
-    restores the whole pose instead, at rest, and releases the block.
+    `obstruction`. Kinds without `_shift` restore the whole pose instead, at
+    rest, and release the block.
 
     Args:
       physics: One world or a batch of worlds.
@@ -300,9 +298,8 @@ class Register(kinds.Kind):
       saturation, never corruption.
 
     Raises:
-      RegisterValueError: If a value is not finite or has a wrong shape, or if
-        it is out of range and the register does not saturate. Nothing is
-        written.
+      RegisterValueError: If a value is not finite or has a wrong shape.
+        Nothing is written.
     """
     value = np.asarray(value, np.float64)[()]
     if self.PORTS and value.shape[-1:] != self._shape:
@@ -314,11 +311,7 @@ class Register(kinds.Kind):
       is_used = where[..., np.newaxis] if self.PORTS else where
       value = np.where(is_used, value, self._initial)
     applied = self.nearest(self._saturated(value))
-    if self._write == 'pose':
-      self._put(physics, applied, where)
-      placed = applied
-    else:
-      placed = self._shift(physics, applied, where)
+    placed = self._shift(physics, applied, where)
     is_placed = placed is applied or self._channel == 'secure'
     obstruction = 0.0 if is_placed else placed - applied
     self._store(physics, applied, obstruction, where)
@@ -339,14 +332,8 @@ class Register(kinds.Kind):
       self._stored_slot.set(physics, applied, where)
 
   def _saturated(self, value: np.ndarray) -> np.ndarray:
-    """Returns values, `(...)`, saturated to the range, or refuses them."""
-    return checks.saturated(
-        value,
-        self.value_range,
-        self._name,
-        self.PORTS,
-        is_strict=self._on_overflow == 'error',
-    )
+    """Returns values, `(...)`, saturated to the range."""
+    return checks.saturated(value, self.value_range, self._name, self.PORTS)
 
   def read(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the reading, `(...)`, in the register's units.

@@ -31,7 +31,6 @@ def saturated(
     value_range: tuple[float, float],
     name: str,
     ports: Sequence[str],
-    is_strict: bool,
 ) -> np.ndarray:
   """Returns values that are saturated to the range of a register.
 
@@ -40,10 +39,9 @@ def saturated(
     value_range: Lowest and highest value that can be stored.
     name: Name of the register.
     ports: Names of its ports.
-    is_strict: True to refuse values out of the range.
 
   Raises:
-    RegisterValueError: If a value is not finite, or is refused.
+    RegisterValueError: If a value is not finite.
   """
   low, high = value_range
   fits = (value >= low) & (value <= high)  # False for NaN.
@@ -52,8 +50,6 @@ def saturated(
   is_finite = np.isfinite(value)
   if not is_finite.all():
     raise _refusal(name, value, ~is_finite, 'must be finite', ports)
-  if is_strict:
-    raise _refusal(name, value, ~fits, f'its range is [{low}, {high}]', ports)
   clipped: np.ndarray = np.where(fits, value, np.clip(value, low, high))[()]
   return clipped
 
