@@ -53,7 +53,7 @@ class Controls:
       return cls((), spec.dtype, (), spec.num_values, known, *bounds)
     if spec.shape[1:] or not spec.shape or spec.dtype.kind not in 'if':
       raise errors.SpecError(
-          f'action_spec: {spec!r:.120}; allowed are a DiscreteArray and a'
+          f'action_spec: {spec!r:.120}; must be a DiscreteArray or a'
           ' one-dimensional array of numbers'
       )
     names = (spec.name or '').split('\t')
@@ -89,7 +89,7 @@ class Controls:
     if self.num_actions is None:
       raise errors.SpecError(
           f'learner {kind!r}: actions are vectors of {self.size} elements;'
-          ' allowed is a design with an action_set'
+          ' the design must have an action_set'
       )
     return self.num_actions
 

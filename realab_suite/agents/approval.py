@@ -25,12 +25,11 @@ from realab_suite import errors
 from realab_suite.agents import base
 from realab_suite.agents import features
 from realab_suite.agents import networks
-from realab_suite.agents import on_policy
 from realab_suite.agents import training
 from realab_suite.config import validation
 
 
-class ApprovalOptions(on_policy.OnPolicyOptions):
+class ApprovalOptions(training.OnPolicyOptions):
   """Options of both approval learners.
 
   Attributes:
@@ -72,7 +71,7 @@ class ApprovalOptions(on_policy.OnPolicyOptions):
   def _without_floor(self) -> 'ApprovalOptions':
     if self.floor and self.form == 'q':
       raise ValueError(
-          f'floor: {self.floor}; allowed is 0 with the form q, which has'
+          f'floor: {self.floor}; must be 0 with the form q, which has'
           ' exploration'
       )
     return self
@@ -123,17 +122,17 @@ class DecoupledApprovalOptions(ApprovalOptions):
     return (self.query, self.other_query)
 
 
-class _ApprovalLearner(on_policy.OnPolicyLearner):
-  """Base class of approval learners; subclasses draw the queries."""
+class _ApprovalLearner(training.OnPolicyLearner, abc.ABC):
+  """Base class of both approval learners, which differ in their options."""
 
   def __init__(self, *args: Any, **kwargs: Any) -> None:
     super().__init__(*args, **kwargs)
     for query in self._options.queries:
       self._controls.check_query('learner', query)
-    num_actions = self._controls.check_discrete(self._options.kind)
+    num_actions = self._controls.size
     if self._options.floor * num_actions >= 1.0:
       raise errors.SpecError(
-          f'learner.floor: {self._options.floor}; allowed are numbers below'
+          f'learner.floor: {self._options.floor}; must be below'
           f' 1/{num_actions}, because there are {num_actions} actions'
       )
     # The last transition, whose feedback comes with the next one.
@@ -181,15 +180,17 @@ class _ApprovalLearner(on_policy.OnPolicyLearner):
     options = self._options
     if options.form == 'q':
       return training.exploration(options, self.num_steps)
-    num_actions = self._controls.check_discrete(options.kind)
-    return np.float32(options.floor * num_actions) if options.floor else None
+    if not options.floor:
+      return None
+    return np.float32(options.floor * self._controls.size)
 
-  @abc.abstractmethod
-  def _query_keys(self, keys: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Returns the random key of each query, `(queries, 2)`.
-
-    Without keys, the query is the action taken.
-    """
+  def _query_keys(self, keys: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+    """Returns the random key of each query; none if it is the action taken."""
+    if self._options.query_policy == 'taken_action':
+      return []
+    words = np.random.SeedSequence(keys['query'].tolist())
+    children = words.spawn(len(self._options.queries))
+    return [child.generate_state(2) for child in children]
 
   def _queries(self, choice: base.Choice) -> dict[str, np.ndarray]:
     asked = choice['asked']
@@ -197,10 +198,7 @@ class _ApprovalLearner(on_policy.OnPolicyLearner):
 
   def _probabilities(self, observation: features.Packed) -> Any:
     return _probabilities(
-        self._encoder,
-        self._networks[0],
-        observation,
-        self._exploration,
+        self._encoder, self._networks[0], observation, self._exploration
     )
 
   def _observe(
@@ -255,10 +253,6 @@ class ValueAdvice(_ApprovalLearner):
   OPTIONS = ValueAdviceOptions
   READS = 'advice'
 
-  def _query_keys(self, keys: Mapping[str, np.ndarray]) -> np.ndarray:
-    del keys
-    return np.zeros((0, 2), np.uint32)
-
 
 @base.LEARNERS.add('decoupled_approval')
 @final
@@ -267,11 +261,6 @@ class DecoupledApproval(_ApprovalLearner):
 
   OPTIONS = DecoupledApprovalOptions
   READS = 'approval'
-
-  def _query_keys(self, keys: Mapping[str, np.ndarray]) -> np.ndarray:
-    num_queries = len(self._options.queries)
-    children = np.random.SeedSequence(keys['query'].tolist()).spawn(num_queries)
-    return np.stack([child.generate_state(2) for child in children])
 
 
 def _log_probs(
@@ -297,7 +286,7 @@ def _choose(
     observation: features.Packed,
     exploration: jax.Array | None,
     act_key: jax.Array,
-    query_keys: jax.Array,
+    query_keys: list[jax.Array],
     greedy: bool,
 ) -> dict[str, jax.Array]:
   encoded = encoder.encode(observation)
@@ -365,12 +354,8 @@ def _offset(agent: dict[str, Any], data: dict[str, Any]) -> Any:
   return agent['following'] * data['last'] if 'following' in agent else 0.0
 
 
-def signs(asked: jax.Array) -> jax.Array:
-  """Returns the sign of the feedback for each queried action: 1, or 1 and -1.
-
-  Args:
-    asked: Queried actions, `(..., 1)`, or pairs of them, `(..., 2)`.
-  """
+def _signs(asked: jax.Array) -> jax.Array:
+  """Returns the sign of the feedback on each query, `(1,)` or `(2,)`."""
   return jnp.array([1.0, -1.0])[: asked.shape[-1]]
 
 
@@ -399,7 +384,7 @@ def policy_objective(
   """
   chosen = jax.nn.one_hot(asked, log_probs.shape[-1])
   log_prob = jnp.sum(chosen * log_probs[..., jnp.newaxis, :], axis=-1)
-  signed = advantage[..., jnp.newaxis] * signs(asked)
+  signed = advantage[..., jnp.newaxis] * _signs(asked)
   if floor:
     is_rare = old_log_prob < jnp.log(floor)
     signed = jnp.where(is_rare, jnp.maximum(signed, 0.0), signed)
@@ -444,7 +429,7 @@ def _value_loss(
   values = agent['values'](data['encoded'])
   chosen = jax.nn.one_hot(data['asked'], values.shape[-1])
   predicted = jnp.sum(chosen * values[..., jnp.newaxis, :], axis=-1)
-  predicted = jnp.sum(predicted * signs(data['asked']), axis=-1)
+  predicted = jnp.sum(predicted * _signs(data['asked']), axis=-1)
   predicted += _offset(agent, data)
   error = predicted - data['feedback']
   loss = 0.5 * training.mean(error**2, data['weight'])

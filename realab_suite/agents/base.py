@@ -1,12 +1,12 @@
-"""Base class of learners, their registry, and the factory `make`."""
+"""Base classes of learners, and of the wrappers around them."""
 
 import abc
 from collections.abc import Mapping
 import copy
-from typing import Annotated, Any, ClassVar, Protocol
+import dataclasses
+from typing import Annotated, Any, ClassVar, Protocol, final
 
 import dm_env
-from dm_env import specs as dm_env_specs
 import jax
 import numpy as np
 import pydantic
@@ -15,11 +15,9 @@ from realab_suite import errors
 from realab_suite.agents import action_encoding
 from realab_suite.agents import features
 from realab_suite.agents import jax_settings
-from realab_suite.config import integers
 from realab_suite.config import registry
 from realab_suite.config import validation
 from realab_suite.feedback import objectives
-from realab_suite.feedback import specs
 
 Positive = Annotated[int, pydantic.Field(gt=0)]
 Fraction = Annotated[float, pydantic.Field(ge=0, le=1)]
@@ -28,6 +26,8 @@ Weight = Annotated[float, pydantic.Field(ge=0, le=1000)]
 Choice = dict[str, np.ndarray]
 FIRST = int(dm_env.StepType.FIRST)
 LAST = int(dm_env.StepType.LAST)
+
+LEARNERS: registry.Registry[type['Learner']] = objectives.LEARNERS
 
 # Each stream has a key of its own, so that the draws of one reveal nothing
 # about the others.
@@ -73,6 +73,95 @@ class Options(validation.Model):
   frame_stack: Annotated[int, pydantic.Field(ge=1, le=16)] = 1
 
 
+@final
+@dataclasses.dataclass(frozen=True)
+class Setting:
+  """What a wrapper or a defence knows of its learner.
+
+  Attributes:
+    options: Options of the learner.
+    encoder: Encoder of observations, without the memory of a learner.
+    controls: Encoder of actions.
+    num_envs: Number of worlds.
+  """
+
+  options: Any
+  encoder: features.Encoder
+  controls: action_encoding.Controls
+  num_envs: int
+
+
+class Wrapper(abc.ABC):
+  """Changes what a learner sees, learns from or does; by default nothing.
+
+  The learner calls the methods in every step, in the order in which they stand
+  here, and keeps the states of its wrappers in its own.
+  """
+
+  # Name of its state in that of the learner.
+  NAME: ClassVar[str]
+
+  def see(
+      self,
+      observation: dict[str, Any],
+      is_first: np.ndarray,
+      earlier: Mapping[str, np.ndarray] | None,
+  ) -> dict[str, Any]:
+    """Returns the observation that the learner gets, each `(worlds, ...)`.
+
+    `is_first` is True where an episode begins, `(worlds,)`, and `earlier` what
+    the learner got in the step before, or `None`.
+    """
+    del is_first, earlier
+    return observation
+
+  def read(self, time_step: TimeStep) -> dict[str, Any]:
+    """Returns further entries of the transition that ends with a time step."""
+    del time_step
+    return {}
+
+  def treat(self, batch: dict[str, Any]) -> dict[str, Any]:
+    """Returns the transitions to learn from; each array is `(..., worlds)`."""
+    return batch
+
+  def holds(self, observation: features.Packed) -> bool:
+    """Returns True if no update may follow the transition to an observation."""
+    del observation
+    return False
+
+  def follow(self) -> None:  # noqa: B027 - Most have nothing to do.
+    """Responds to an update of the networks."""
+
+  def steer(
+      self,
+      choice: Choice,
+      time_step: TimeStep,
+      observation: features.Packed,
+      key: np.ndarray,
+  ) -> Choice:
+    """Returns the choice to act on, and leaves the given one as it is."""
+    del time_step, observation, key
+    return choice
+
+  def queries(self, choice: Choice) -> dict[str, np.ndarray]:
+    """Returns the values of query registers by name, each `(worlds,)`."""
+    del choice
+    return {}
+
+  @property
+  def metrics(self) -> Mapping[str, float]:
+    """Metrics of the latest update, by name."""
+    return {}
+
+  def state(self) -> dict[str, Any]:
+    """Returns the complete state, as plain data."""
+    return {}
+
+  def set_state(self, state: Mapping[str, Any]) -> None:
+    """Continues from a state, or raises a `StateLayoutError` and does not."""
+    del state  # There is none by default.
+
+
 class Learner(abc.ABC):
   """Learner that acts in a batch of worlds, and updates itself within `step`.
 
@@ -83,8 +172,13 @@ class Learner(abc.ABC):
   OPTIONS: ClassVar[type[Options]]
   # The option with the name of the register whose reading is learned from.
   READS: ClassVar[str]
-  # True if it can learn from the actions of others; see `watch`.
+  # Options that ask for wrappers, from the innermost on.
+  WRAPPED: ClassVar[tuple[str, ...]] = ('frame_stack',)
+  # True if it can learn from the actions of others; see `watch`. A wrapper that
+  # acts sets it to False.
   is_off_policy = False
+  # Largest sum of readings of an episode that it credits, which a wrapper sets.
+  largest_credit: float | None = None
   # Networks and the state of the optimiser, a pytree of arrays that a subclass
   # makes in `__init__`.
   _networks: Any
@@ -98,15 +192,10 @@ class Learner(abc.ABC):
       num_envs: int,
       seed: int,
   ) -> None:
-    """Makes a learner; `make` derives the arguments from specs.
+    """Makes a learner; `factory.make` derives the arguments from specs.
 
-    Args:
-      options: An instance of `OPTIONS`.
-      reading: Key in the observation of the reading to learn from.
-      encoder: Encoder of observations.
-      controls: Encoder of actions.
-      num_envs: Number of worlds.
-      seed: Seed of all random draws.
+    They are those of `Setting`, with `reading`, the key in the observation of
+    the reading to learn from, and `seed`, that of all random draws.
     """
     self._options = options
     self._reading = reading
@@ -123,6 +212,26 @@ class Learner(abc.ABC):
     # The last observation and choice, until the next time step arrives.
     self._last: dict[str, Any] | None = None
     self._metrics: dict[str, float] = {}
+    self._wrappers: list[Wrapper] = []
+
+  def wrap(self, wrapper: Wrapper) -> None:
+    """Adds a wrapper, around those that there are."""
+    self._wrappers.append(wrapper)
+
+  @property
+  def setting(self) -> Setting:
+    """What wrappers know of the learner."""
+    encoder = self._encoder.without_memory()
+    return Setting(self._options, encoder, self._controls, self._num_envs)
+
+  @property
+  def networks(self) -> Any:
+    """Networks and the state of the optimiser, a pytree of arrays."""
+    return self._networks
+
+  @networks.setter
+  def networks(self, networks: Any) -> None:
+    self._networks = networks
 
   @property
   def num_envs(self) -> int:
@@ -133,11 +242,6 @@ class Learner(abc.ABC):
   def num_steps(self) -> int:
     """Number of control steps so far, summed over worlds."""
     return self._num_acts * self._num_envs
-
-  @property
-  def largest_credit(self) -> float | None:
-    """Largest sum of readings of an episode that it credits, or `None`."""
-    return None
 
   @jax_settings.pinned()
   def step(self, time_step: TimeStep) -> np.ndarray:
@@ -153,8 +257,10 @@ class Learner(abc.ABC):
       SpecError: If the observation does not match its spec.
     """
     observation = self._learn_from(time_step)
-    choice = self._choose(observation, self._act_keys(), greedy=False)
-    choice = self._steered(choice, time_step, observation)
+    keys = {name: self.key(name, self._num_acts) for name in ('act', 'query')}
+    choice = self._choose(observation, keys, greedy=False)
+    for wrapper in self._wrappers:
+      choice = wrapper.steer(choice, time_step, observation, keys['query'])
     self._last = {'observation': observation, 'choice': choice}
     self._num_acts += 1
     return self._encode(choice)
@@ -177,8 +283,8 @@ class Learner(abc.ABC):
     if not self.is_off_policy:
       raise errors.SpecError(
           f'learner {self._options.kind!r}: learns from its own actions alone,'
-          ' as set here; allowed for recorded episodes are off-policy learners,'
-          ' such as behavioural_cloning, and q_learning without a gate'
+          ' as set here; a learner from recorded episodes must be off-policy,'
+          ' such as behavioural_cloning, or q_learning without a gate'
       )
     observation = self._learn_from(time_step)
     # Queries stand before the index of an action.
@@ -202,8 +308,9 @@ class Learner(abc.ABC):
           # The step that begins an episode ignores the action, so it is not an
           # outcome of the last choice.
           'is_valid': step_type != FIRST,
-          **self._also_read(time_step),
       }
+      for wrapper in self._wrappers:
+        transition |= wrapper.read(time_step)
       self._observe(transition, observation)
     return observation
 
@@ -214,17 +321,20 @@ class Learner(abc.ABC):
   def stack(
       self, time_step: TimeStep, earlier: Mapping[str, np.ndarray] | None
   ) -> Mapping[str, np.ndarray]:
-    """Returns the observation for `act`, with images stacked if an option says.
+    """Returns the observation for `act`, with what wrappers add to it.
 
-    `act` has no memory, so its caller keeps the images: each result is the
-    `earlier` of the next step.
+    `act` remembers nothing, so its caller keeps earlier images and the state of
+    a memory: each result is the `earlier` of the next step.
 
     Args:
       time_step: Time step of any number of worlds.
       earlier: Result for the step before, or `None` for the first one.
     """
+    observation = dict(time_step.observation)
     is_first = np.asarray(time_step.step_type) == FIRST
-    return self._encoder.stack(time_step.observation, is_first, earlier)
+    for wrapper in self._wrappers:
+      observation = wrapper.see(observation, is_first, earlier)
+    return observation
 
   @jax_settings.pinned()
   def act(
@@ -237,7 +347,8 @@ class Learner(abc.ABC):
 
     Args:
       observation: Observations by name, each `(worlds, ...)`, for any number of
-        worlds; a result of `stack` if `frame_stack` is above 1.
+        worlds; a result of `stack` if the learner has a `frame_stack` above 1
+        or a memory.
       key: Random key, two numbers of dtype uint32.
       greedy: True to take the best action instead of drawing one.
 
@@ -250,8 +361,7 @@ class Learner(abc.ABC):
     seeds = np.random.SeedSequence([int(word) for word in key]).spawn(2)
     act, query = (child.generate_state(2) for child in seeds)
     keys = {'act': act, 'query': query}
-    packed = self._encoder.pack(observation, _num_envs(observation))
-    return self._encode(self._choose(packed, keys, greedy=greedy))
+    return self._encode(self._choose(self._pack(observation), keys, greedy))
 
   @jax_settings.pinned()
   def probabilities(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -264,8 +374,7 @@ class Learner(abc.ABC):
       SpecError: If the actions are vectors.
     """
     self._controls.check_discrete(self._options.kind)
-    packed = self._encoder.pack(observation, _num_envs(observation))
-    return np.asarray(self._probabilities(packed))
+    return np.asarray(self._probabilities(self._pack(observation)))
 
   def settings(self) -> dict[str, Any]:
     """Returns the device and the JAX settings that can change results.
@@ -299,6 +408,9 @@ class Learner(abc.ABC):
         'metrics': dict(self._metrics),
         'trained': to_plain(self._networks),
         'memory': copy.deepcopy(self._memory()),
+        'wrappers': copy.deepcopy(
+            {wrapper.NAME: wrapper.state() for wrapper in self._wrappers}
+        ),
     }
 
   @jax_settings.pinned()
@@ -314,7 +426,16 @@ class Learner(abc.ABC):
           f'state of a learner: kind {state.get("kind")!r}; this learner is'
           f' {self._options.kind!r}'
       )
-    self._networks = from_plain(self._networks, state['trained'])
+    networks = from_plain(self._networks, state['trained'])
+    names = sorted(wrapper.NAME for wrapper in self._wrappers)
+    if sorted(state['wrappers']) != names:
+      raise errors.StateLayoutError(
+          f'state of a learner: wrappers {sorted(state["wrappers"])}, expected'
+          f' {names}'
+      )
+    for wrapper in self._wrappers:
+      wrapper.set_state(copy.deepcopy(state['wrappers'][wrapper.NAME]))
+    self._networks = networks
     self._set_memory(copy.deepcopy(state['memory']))
     self._num_acts = int(state['num_acts'])
     self._num_updates = int(state['num_updates'])
@@ -322,36 +443,41 @@ class Learner(abc.ABC):
     self._last = copy.deepcopy(state['last'])
     self._metrics = dict(state['metrics'])
 
-  def _act_keys(self) -> dict[str, np.ndarray]:
-    """Returns the random keys of this step's choice, by stream."""
-    return {
-        name: folded(self._keys[name], self._num_acts)
-        for name in ('act', 'query')
-    }
+  def key(self, stream: str, number: int) -> np.ndarray:
+    """Returns the random key of a numbered draw of a stream, two numbers."""
+    return folded(self._keys[stream], number)
+
+  def update_key(self) -> np.ndarray:
+    """Returns the random key of the next update, two numbers."""
+    return self.key('update', self._num_updates)
 
   def _initial_generator(self) -> np.random.Generator:
     """Returns the random generator of the networks' initial weights."""
-    key = self._keys['initial'].astype(np.uint64)
-    return np.random.Generator(np.random.Philox(key=key))
+    return generator_of(self._keys['initial'])
 
-  def _update_key(self) -> np.ndarray:
-    """Returns the random key of the next update."""
-    return folded(self._keys['update'], self._num_updates)
+  def _pack(self, observation: Mapping[str, np.ndarray]) -> features.Packed:
+    num_envs = len(next(iter(observation.values())))
+    return self._encoder.pack(observation, num_envs)
 
   def _encode(self, choice: Choice) -> np.ndarray:
-    return self._controls.encode(choice['action'], self._queries(choice))
+    queries = dict(self._queries(choice))
+    for wrapper in self._wrappers:
+      queries |= wrapper.queries(choice)
+    return self._controls.encode(choice['action'], queries)
 
-  def _steered(
-      self, choice: Choice, time_step: TimeStep, observation: features.Packed
-  ) -> Choice:
-    """Returns the choice to act on, which may not be the learner's own."""
-    del time_step, observation
-    return choice
+  def _treated(self, batch: dict[str, Any]) -> dict[str, Any]:
+    """Returns what wrappers make of transitions."""
+    for wrapper in self._wrappers:
+      batch = wrapper.treat(batch)
+    return batch
 
-  def _also_read(self, time_step: TimeStep) -> dict[str, Any]:
-    """Returns further entries of the transition that ends with a time step."""
-    del time_step
-    return {}
+  def _report(self, metrics: Mapping[str, Any]) -> None:
+    """Sets the metrics of an update, to which those of wrappers are added."""
+    self._metrics = {
+        name: float(value)
+        for part in (*(wrapper.metrics for wrapper in self._wrappers), metrics)
+        for name, value in part.items()
+    }
 
   def _queries(self, choice: Choice) -> dict[str, np.ndarray]:
     """Returns the values of query registers by name, each `(worlds,)`."""
@@ -403,96 +529,15 @@ class Learner(abc.ABC):
     del memory  # There is none in this base class.
 
 
-LEARNERS: registry.Registry[type[Learner]] = objectives.LEARNERS
-
-
-def make(
-    spec: specs.LearnerSpec | Mapping[str, Any] | None,
-    observation_spec: Mapping[str, dm_env_specs.Array],
-    action_spec: dm_env_specs.Array,
-    num_envs: int,
-    seed: int,
-) -> Learner:
-  """Makes the learner of a design.
-
-  Args:
-    spec: The `learner` of a design, or a mapping with `kind` and options.
-    observation_spec: Observation spec of one world.
-    action_spec: Action spec of one world.
-    num_envs: Number of worlds.
-    seed: Seed of all random draws, a non-negative integer.
-
-  Raises:
-    SpecError: If the learner is unknown, an option is invalid, or the specs
-      lack a register that the learner needs.
-  """
-  num_envs = integers.check('num_envs', num_envs, 1)
-  seed = integers.check('seed', seed, 0, high=None)
-  options = options_of(spec)
-  learner_class = LEARNERS.get(options.kind)
-  return learner_class(
-      options,
-      _find_reading(options, learner_class.READS, observation_spec),
-      features.Encoder.from_spec(observation_spec, options.frame_stack),
-      action_encoding.Controls.from_spec(action_spec),
-      num_envs,
-      seed,
-  )
-
-
-def options_of(
-    spec: specs.LearnerSpec | Mapping[str, Any] | None,
-) -> Options:
-  """Returns the options of a learner.
-
-  Args:
-    spec: As for `make`.
-
-  Raises:
-    SpecError: If the learner is unknown, or an option is invalid.
-  """
-  if spec is None:
-    raise errors.SpecError(
-        'learner: None; allowed are a design with a learner, and a mapping'
-        f' whose kind is one of {sorted(LEARNERS)}'
-    )
-  if not isinstance(spec, specs.LearnerSpec):
-    spec = validation.validate(specs.LearnerSpec, spec, 'learner')
-  # The objective is for evaluators.
-  given = {k: v for k, v in spec.model_dump().items() if k != 'objective'}
-  options = LEARNERS.get(spec.kind).OPTIONS
-  return validation.validate(options, given, 'learner')
-
-
-def _find_reading(
-    options: Options,
-    field: str,
-    observation_spec: Mapping[str, dm_env_specs.Array],
-) -> str:
-  """Returns the observation key of the reading that a learner learns from."""
-  register = getattr(options, field)
-  key = features.key_of(register, observation_spec)
-  if key is not None:
-    if observation_spec[key].shape:
-      raise errors.SpecError(
-          f'learner.{field}: {key!r} has shape {observation_spec[key].shape};'
-          ' allowed are scalars'
-      )
-    return key
-  raise errors.SpecError(
-      f'learner.{field}: the agent does not read {register!r}; this environment'
-      f' has {sorted(observation_spec)}'
-  )
-
-
-def _num_envs(observation: Mapping[str, np.ndarray]) -> int:
-  return len(next(iter(observation.values())))
-
-
 def folded(key: np.ndarray, number: int) -> np.ndarray:
   """Returns the random key for a numbered step of a stream, `(2,)`."""
   words = [*(int(word) for word in key), number]
   return np.random.SeedSequence(words).generate_state(2)
+
+
+def generator_of(key: np.ndarray) -> np.random.Generator:
+  """Returns the random generator of NumPy for a key of two numbers."""
+  return np.random.Generator(np.random.Philox(key=key.astype(np.uint64)))
 
 
 def to_plain(tree: Any) -> dict[str, np.ndarray]:

@@ -16,12 +16,11 @@ import numpy as np
 from realab_suite.agents import base
 from realab_suite.agents import features
 from realab_suite.agents import networks
-from realab_suite.agents import on_policy
 from realab_suite.agents import training
 
 
 @final
-class BehaviouralCloningOptions(on_policy.OnPolicyOptions):
+class BehaviouralCloningOptions(training.OnPolicyOptions):
   """Options of `behavioural_cloning`.
 
   Attributes:
@@ -35,7 +34,7 @@ class BehaviouralCloningOptions(on_policy.OnPolicyOptions):
 
 @base.LEARNERS.add('behavioural_cloning')
 @final
-class BehaviouralCloning(on_policy.OnPolicyLearner):
+class BehaviouralCloning(training.OnPolicyLearner):
   """Imitates the demonstrated action for each observation."""
 
   OPTIONS = BehaviouralCloningOptions

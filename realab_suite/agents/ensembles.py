@@ -1,5 +1,9 @@
-"""Ensembles of networks that predict rewards, from readings or comparisons."""
+"""Ensembles of networks that predict rewards, from readings or comparisons.
 
+Their samples are spans of several consecutive steps, also across batches.
+"""
+
+from collections.abc import Mapping
 import functools
 from typing import Any
 
@@ -85,7 +89,7 @@ def fit(
     shape: Number of gradient steps, of networks, and of samples of each.
     key: Random key, two numbers.
   """
-  generator = np.random.Generator(np.random.Philox(key=key.astype(np.uint64)))
+  generator = base.generator_of(key)
   drawn = generator.integers(len(ends), size=shape)
   samples = ends[drawn].astype(np.int32), targets[drawn].astype(np.float32)
   return _descend(options, span, trained, data, samples)
@@ -115,3 +119,46 @@ def _descend(
 
   one_step = jax.vmap(functools.partial(training.descend, options, loss))
   return jax.lax.scan(one_step, trained, samples)[0]
+
+
+def initial_spans(
+    encoder: features.Encoder, num_more: int, num_envs: int, span: int
+) -> dict[str, Any]:
+  """Returns the state of `join_spans` before the first batch.
+
+  `num_more` is that of `networks.Network`, `span` the number of steps of a
+  sample.
+  """
+  lead = (span - 1, num_envs)
+  tail = {
+      name: np.zeros((*lead, *shape), np.uint8)
+      for name, shape in encoder.image_shapes.items()
+  }
+  size = encoder.vector_size + num_more
+  tail['vector'] = np.zeros((*lead, size), np.float32)
+  return {'tail': tail, 'ages': np.zeros(num_envs, int)}
+
+
+def join_spans(
+    state: Mapping[str, Any], data: Mapping[str, Any], is_valid: np.ndarray
+) -> tuple[dict[str, np.ndarray], np.ndarray, dict[str, Any]]:
+  """Returns features from `span - 1` steps before a batch on, and its ages.
+
+  Args:
+    state: State that `initial_spans` or the last call returned.
+    data: Features of the batch, each `(time, worlds, ...)`.
+    is_valid: Same as in the batch, `(time, worlds)` bool.
+
+  Returns:
+    The features; the number of each step of the batch in its episode, from 1,
+    `(time, worlds)` int, 0 where it is not valid; and the next state.
+  """
+  joined = {
+      name: np.concatenate([before, np.asarray(data[name])])
+      for name, before in state['tail'].items()
+  }
+  ages, age = np.zeros(is_valid.shape, int), state['ages']
+  for t, is_outcome in enumerate(is_valid):
+    ages[t] = age = np.where(is_outcome, age + 1, 0)
+  tail = {name: value[len(ages) :].copy() for name, value in joined.items()}
+  return joined, ages, {'tail': tail, 'ages': age}

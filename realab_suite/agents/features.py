@@ -65,11 +65,9 @@ class Encoder:
 
   Attributes:
     entries: Encoding of each entry of the observation.
-    frame_stack: Number of images of an entry that are stacked on channels.
   """
 
   entries: tuple[_Entry, ...]
-  frame_stack: int = 1
 
   @classmethod
   def from_spec(
@@ -79,8 +77,7 @@ class Encoder:
 
     Args:
       observation_spec: Observation spec of one world.
-      frame_stack: Number of images to stack; observations must then have been
-        through `stack`.
+      frame_stack: Number of images that are stacked on the channels of one.
 
     Raises:
       SpecError: If an entry is not numeric, or there is no image to stack.
@@ -95,22 +92,27 @@ class Encoder:
         for name, spec in observation_spec.items()
         if name not in rays.values()
     ]
-    encoder = cls(tuple(entries), frame_stack)
+    encoder = cls(tuple(entries))
     if frame_stack > 1 and not encoder.image_shapes:
       raise errors.SpecError(
-          f'learner.frame_stack: {frame_stack}; allowed is 1, because no entry'
+          f'learner.frame_stack: {frame_stack}; must be 1, because no entry'
           f' of the observation is an image: {sorted(observation_spec)}'
       )
     return encoder
 
   def with_memory(self, units: int) -> 'Encoder':
-    """Returns an encoder whose last features are the memory of a learner.
+    """Returns an encoder whose last features are a memory of a learner, if any.
 
     Args:
-      units: Number of elements of the entry `MEMORY` of observations.
+      units: Number of elements of the entry `MEMORY`; 0 for none.
     """
+    entries = self.without_memory().entries
     memory = _Entry(MEMORY, 'plain', (units,), 'float32')
-    return dataclasses.replace(self, entries=(*self.entries, memory))
+    return Encoder((*entries, memory) if units else entries)
+
+  def without_memory(self) -> 'Encoder':
+    """Returns an encoder of the same observations without a memory."""
+    return Encoder(tuple(e for e in self.entries if e.name != MEMORY))
 
   @property
   def image_shapes(self) -> dict[str, tuple[int, ...]]:
@@ -132,33 +134,6 @@ class Encoder:
         if entry.kind != 'image'
     )
 
-  def stack(
-      self,
-      observation: Mapping[str, Any],
-      is_first: np.ndarray,
-      earlier: Mapping[str, Any] | None,
-  ) -> dict[str, Any]:
-    """Returns an observation with the last images stacked, the newest last.
-
-    Copies of the first image of an episode stand for those before it.
-
-    Args:
-      observation: Observations by name, each `(worlds, ...)`.
-      is_first: Whether each world's episode begins here, `(worlds,)` bool.
-      earlier: Result of the step before, or `None` to begin with this one.
-    """
-    stacked = dict(observation)
-    for name in self.image_shapes if self.frame_stack > 1 else ():
-      image = np.asarray(observation[name])
-      copies = np.concatenate([image] * self.frame_stack, axis=-1)
-      if earlier is not None:
-        kept = np.asarray(earlier[name])[..., image.shape[-1] :]
-        later = np.concatenate([kept, image], axis=-1)
-        is_new = np.asarray(is_first)[:, np.newaxis, np.newaxis, np.newaxis]
-        copies = np.where(is_new, copies, later)
-      stacked[name] = copies
-    return stacked
-
   def pack(self, observation: Mapping[str, Any], num_envs: int) -> Packed:
     """Checks an observation of a batch, and copies the entries to encode.
 
@@ -171,12 +146,11 @@ class Encoder:
     """
     packed = {}
     for entry in self.entries:
-      packed[entry.name] = _take(
-          observation, entry.name, entry.shape, entry.dtype, num_envs
-      )
+      shape = (num_envs, *entry.shape)
+      packed[entry.name] = _take(observation, entry.name, shape, entry.dtype)
       if entry.partner:
         packed[entry.partner] = _take(
-            observation, entry.partner, entry.shape, 'float32', num_envs
+            observation, entry.partner, shape, 'float32'
         )
     return packed
 
@@ -211,6 +185,25 @@ def key_of(register: str, observation: Collection[str]) -> str | None:
   return next((key for key in keys if key in observation), None)
 
 
+def find_key(where: str, register: str, observation: Collection[str]) -> str:
+  """Returns the key of the reading of a register, which must exist.
+
+  Args:
+    where: Location of the name of the register, for the message.
+    register: Name of the register.
+    observation: Keys of observations.
+
+  Raises:
+    SpecError: If there is no such reading.
+  """
+  if (key := key_of(register, observation)) is None:
+    raise errors.SpecError(
+        f'{where}: the agent does not read {register!r}; this environment has'
+        f' {sorted(observation)}'
+    )
+  return key
+
+
 def _features(
     entry: _Entry, value: jax.Array, packed: Mapping[str, Any]
 ) -> jax.Array:
@@ -242,22 +235,16 @@ def _take(
     name: str,
     shape: tuple[int, ...],
     dtype: str,
-    num_envs: int,
 ) -> np.ndarray:
-  """Returns a copy of one entry of an observation.
-
-  Raises:
-    SpecError: If the entry is missing or has another shape.
-  """
-  expected = (num_envs, *shape)
+  """Returns a copy of one entry of an observation, if it has the shape."""
   if name not in observation:
     raise errors.SpecError(
         f'observation: {name!r} is missing; it has {sorted(observation)}'
     )
   value = np.array(observation[name], dtype)
-  if value.shape != expected:
+  if value.shape != shape:
     raise errors.SpecError(
-        f'observation {name!r}: shape {value.shape}, expected {expected}'
+        f'observation {name!r}: shape {value.shape}, expected {shape}'
     )
   return value
 
@@ -286,14 +273,16 @@ def _entry(
   dtype = np.dtype(spec.dtype)
   if dtype.kind not in 'biuf':
     raise errors.SpecError(
-        f'observation_spec {name!r}: dtype {dtype}; allowed are numeric dtypes'
+        f'observation_spec {name!r}: dtype {dtype}; must be numeric'
     )
   if dtype == np.uint8 and len(spec.shape) == 3:
     *size, channels = spec.shape
     return _Entry(name, 'image', (*size, channels * frame_stack), 'uint8')
   if name.startswith('registers/'):
     return _Entry(name, 'reading', spec.shape, 'float32')
-  low, high = _bounds(spec)
+  low, high = -np.inf, np.inf
+  if isinstance(spec, specs.BoundedArray):
+    low, high = float(np.min(spec.minimum)), float(np.max(spec.maximum))
   if partner:
     values = _values(spec, low, high)
     return _Entry(name, 'rays', spec.shape, 'int32', low, high, partner, values)
@@ -310,10 +299,3 @@ def _values(spec: specs.Array, low: float, high: float) -> tuple[int, ...]:
   if isinstance(spec, appearance.ClassArray):
     return spec.codes
   return tuple(range(int(low), int(high) + 1))
-
-
-def _bounds(spec: specs.Array) -> tuple[float, float]:
-  """Returns the smallest lower and the largest upper bound of all elements."""
-  if not isinstance(spec, specs.BoundedArray):
-    return -np.inf, np.inf
-  return float(np.min(spec.minimum)), float(np.max(spec.maximum))

@@ -60,12 +60,7 @@ class Convolutions(eqx.Module):
 
   @staticmethod
   def output_size(height: int, width: int) -> int:
-    """Returns the length of the output vector.
-
-    Args:
-      height: Height of the images, in pixels.
-      width: Width of the images, in pixels.
-    """
+    """Returns the length of the output for images of a size in pixels."""
     for _, stride in _CONVOLUTIONS:
       height, width = -(-height // stride), -(-width // stride)
     return height * width * _CONVOLUTIONS[-1][0]
@@ -251,24 +246,14 @@ class Memory(eqx.Module):
       units: int,
       generator: np.random.Generator,
   ) -> None:
-    """Makes a unit.
-
-    Args:
-      encoder: Encoder of observations, without the state.
-      units: Number of elements of the state.
-      generator: Random generator of the initial weights.
-    """
-    self.inputs = Network(encoder, (), 3 * units, 1.0, generator)
+    """Makes a unit whose state has a number of elements."""
+    seen = encoder.without_memory()
+    self.inputs = Network(seen, (), 3 * units, 1.0, generator)
     self.recurrent = Linear(units, 3 * units, 1.0, generator)
 
   def __call__(self, encoded: dict[str, jax.Array]) -> dict[str, jax.Array]:
-    """Returns features with the state after an observation.
-
-    Args:
-      encoded: Features with the state before it.
-    """
-    inputs, state = self._split(encoded)
-    return self._joined(encoded, self._next(inputs, state))
+    """Returns features, given those with the state before an observation."""
+    return self._joined(encoded, self._next(*self._split(encoded)))
 
   def through(
       self, encoded: dict[str, jax.Array], continues: jax.Array
@@ -336,13 +321,8 @@ class Policy(eqx.Module):
   ) -> None:
     """Makes a policy whose initial output hardly depends on observations.
 
-    Args:
-      encoder: Encoder whose features are the input.
-      hidden: Widths of the hidden layers.
-      size: Number of actions if they are discrete, otherwise of the elements of
-        an action.
-      is_discrete: True for discrete actions, False for vectors.
-      generator: Random generator of the initial weights.
+    `size` is the number of discrete actions, or of the elements of a vector;
+    the other arguments are those of `Network`.
     """
     self.network = Network(encoder, hidden, size, 0.01, generator)
     self.log_std = None if is_discrete else jnp.full(size, -0.5, jnp.float32)
@@ -388,14 +368,6 @@ def probabilities(
 ) -> jax.Array:
   """Returns the probability of each discrete action, `(worlds, actions)`."""
   return jax.nn.softmax(policy(encoder.encode(observation)).logits)
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def values(
-    encoder: features.Encoder, network: Network, observation: features.Packed
-) -> jax.Array:
-  """Returns the value of each discrete action, `(worlds, actions)`."""
-  return network(encoder.encode(observation))
 
 
 def _orthogonal(

@@ -11,19 +11,15 @@ import numpy as np
 import pydantic
 
 from realab_suite.agents import base
-from realab_suite.agents import defences
 from realab_suite.agents import features
-from realab_suite.agents import guards
-from realab_suite.agents import jax_settings
 from realab_suite.agents import networks
-from realab_suite.agents import on_policy
 from realab_suite.agents import training
 from realab_suite.config import option_types
 from realab_suite.feedback import objectives
 
 
 @final
-class PolicyGradientOptions(on_policy.OnPolicyOptions):
+class PolicyGradientOptions(training.OnPolicyOptions):
   """Options of `policy_gradient`.
 
   Attributes:
@@ -37,7 +33,8 @@ class PolicyGradientOptions(on_policy.OnPolicyOptions):
       it is worth what the last observation is, as in an episode without end, or
       `ends` if it is worth nothing, as the evaluation counts it. In a run with
       sleep, episodes end at checkpoints as by a time limit.
-    defence: What the learner does about corrupted rewards; `None` for nothing.
+    defence: What the learner does about corrupted rewards, a
+      `defences.Defence`; `None` for nothing.
   """
 
   kind: Literal['policy_gradient']
@@ -48,10 +45,9 @@ class PolicyGradientOptions(on_policy.OnPolicyOptions):
   clip: base.Fraction = 0.2
   memory: Annotated[int, pydantic.Field(ge=0, le=4096)] = 0
   time_limit: Literal['continues', 'ends'] = 'continues'
-  defence: (
-      Annotated[defences.Defence, option_types.ModelIn(defences.DEFENCES)]
-      | None
-  ) = None
+  defence: Annotated[Any, option_types.ModelIn(objectives.DEFENCES)] | None = (
+      None
+  )
 
 
 @final
@@ -65,20 +61,31 @@ class ActorCritic(eqx.Module):
   def __call__(
       self, encoded: dict[str, jax.Array]
   ) -> networks.Categorical | networks.Gaussian:
-    if self.memory is not None:
-      encoded = self.memory(encoded)
-    return self.policy(encoded)
+    return self.policy(self.seen(encoded))
+
+  def seen(
+      self, encoded: dict[str, jax.Array], continues: Any = None
+  ) -> dict[str, jax.Array]:
+    """Returns the features that the policy and the value function see.
+
+    With `continues`, they are those of a sequence (`networks.Memory.through`).
+    """
+    if self.memory is None:
+      return encoded
+    if continues is None:
+      return self.memory(encoded)
+    return self.memory.through(encoded, continues)
 
 
 @base.LEARNERS.add('policy_gradient')
 @final
-class PolicyGradient(on_policy.OnPolicyLearner):
+class PolicyGradient(training.OnPolicyLearner):
   """Proximal policy optimisation, for discrete and for vector actions."""
 
   OPTIONS = PolicyGradientOptions
   READS = 'reward'
+  WRAPPED = ('frame_stack', 'memory', 'defence')
 
-  @jax_settings.pinned()
   def __init__(
       self,
       options: Any,
@@ -87,36 +94,19 @@ class PolicyGradient(on_policy.OnPolicyLearner):
       *args: Any,
       **kwargs: Any,
   ) -> None:
-    # Compiled functions depend on the other options alone.
-    plain = options.model_copy(update={'defence': None})
-    self._seen = encoder
-    if options.memory:
-      encoder = encoder.with_memory(options.memory)
-    super().__init__(plain, reading, encoder, *args, **kwargs)
-    self._guard: guards.Guard | None = None
-    if options.defence is not None:
-      setting = defences.Setting(
-          plain, self._seen, self._controls, self._num_envs
-      )
-      key = base.folded(self._keys['initial'], 1).astype(np.uint64)
-      generator = np.random.Generator(np.random.Philox(key=key))
-      self._guard = guards.Guard(options.defence, setting, generator)
-    self._scale = training.FeedbackScale(self._num_envs, self._options.gamma)
+    encoder = encoder.with_memory(options.memory)
+    super().__init__(options, reading, encoder, *args, **kwargs)
+    self._scale = training.FeedbackScale(self._num_envs, options.gamma)
 
   def _initial_networks(self, generator: np.random.Generator) -> Any:
-    controls, hidden = self._controls, self._options.hidden
+    hidden, units = self._options.hidden, self._options.memory
+    size, num_actions = self._controls.size, self._controls.num_actions
     agent = ActorCritic(
         networks.Policy(
-            self._encoder,
-            hidden,
-            controls.size,
-            controls.num_actions is not None,
-            generator,
+            self._encoder, hidden, size, num_actions is not None, generator
         ),
         networks.Network(self._encoder, hidden, 1, 1.0, generator),
-        networks.Memory(self._seen, self._options.memory, generator)
-        if self._options.memory
-        else None,
+        networks.Memory(self._encoder, units, generator) if units else None,
     )
     return agent, training.optimizer(self._options).init(agent)
 
@@ -126,30 +116,13 @@ class PolicyGradient(on_policy.OnPolicyLearner):
       keys: Mapping[str, np.ndarray],
       greedy: bool,
   ) -> base.Choice:
-    agent = self._networks[0]
     action, log_prob = networks.act(
-        self._encoder, agent, observation, keys['act'], greedy
+        self._encoder, self._networks[0], observation, keys['act'], greedy
     )
     return {'action': np.asarray(action), 'log_prob': np.asarray(log_prob)}
 
-  @jax_settings.pinned()
-  def stack(
-      self,
-      time_step: base.TimeStep,
-      earlier: Mapping[str, np.ndarray] | None,
-  ) -> Mapping[str, np.ndarray]:
-    stacked = super().stack(time_step, earlier)
-    if not self._options.memory:
-      return stacked
-    # The state before this observation, 0 where an episode begins.
-    is_first = np.asarray(time_step.step_type) == base.FIRST
-    state = np.zeros((len(is_first), self._options.memory), np.float32)
-    if earlier is not None:
-      packed = self._encoder.pack(earlier, len(is_first))
-      memory = self._networks[0].memory
-      known = np.asarray(_remember(self._encoder, memory, packed))
-      state = np.where(is_first[:, np.newaxis], state, known)
-    return {**stacked, features.MEMORY: state}
+  def _probabilities(self, observation: features.Packed) -> Any:
+    return networks.probabilities(self._encoder, self._networks[0], observation)
 
   def _discount(self, time_step: base.TimeStep) -> np.ndarray:
     discount = super()._discount(time_step)
@@ -157,40 +130,14 @@ class PolicyGradient(on_policy.OnPolicyLearner):
       return discount
     return np.where(np.asarray(time_step.step_type) == base.LAST, 0, discount)
 
-  @property
-  def largest_credit(self) -> float | None:
-    return None if self._guard is None else self._guard.largest_credit
-
-  def _steered(
-      self,
-      choice: base.Choice,
-      time_step: base.TimeStep,
-      observation: features.Packed,
-  ) -> base.Choice:
-    if self._guard is None:
-      return choice
-    return self._guard.steer(choice, time_step, self._act_keys()['query'])
-
-  def _also_read(self, time_step: base.TimeStep) -> dict[str, Any]:
-    return {} if self._guard is None else self._guard.read(time_step)
-
-  def _queries(self, choice: base.Choice) -> dict[str, np.ndarray]:
-    return {} if self._guard is None else self._guard.queries(choice)
-
-  def _probabilities(self, observation: features.Packed) -> Any:
-    return networks.probabilities(self._encoder, self._networks[0], observation)
-
   def _learn(
       self, batch: dict[str, Any], observation: features.Packed
   ) -> dict[str, Any]:
-    metrics, continues = {}, batch['is_valid']
-    if self._guard is not None:
-      key = base.folded(self._update_key(), 1)
-      batch = self._guard.treat(batch, self.num_steps, key)
-      metrics = dict(self._guard.metrics)
+    # A memory goes on where a defence leaves a step out.
+    continues, batch = batch['is_valid'], self._treated(batch)
     self._scale.update(batch)
     reading = batch['reading'] / np.float32(self._scale.value)
-    self._networks, updated = _update(
+    self._networks, metrics = _update(
         self._options,
         self._encoder,
         self._networks,
@@ -198,27 +145,14 @@ class PolicyGradient(on_policy.OnPolicyLearner):
         observation,
         self._draw_minibatches(by_world=self._options.memory > 0),
     )
-    return {**metrics, **updated, 'feedback_scale': self._scale.value}
+    return {**metrics, 'feedback_scale': self._scale.value}
 
   def _memory(self) -> dict[str, Any]:
-    guard = {} if self._guard is None else {'guard': self._guard.state()}
-    return {**super()._memory(), 'scale': self._scale.state(), **guard}
+    return {**super()._memory(), 'scale': self._scale.state()}
 
   def _set_memory(self, memory: dict[str, Any]) -> None:
-    if self._guard is not None:
-      self._guard.set_state(memory['guard'])
     super()._set_memory(memory)
     self._scale.set_state(memory['scale'])
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _remember(
-    encoder: features.Encoder,
-    memory: networks.Memory,
-    observation: features.Packed,
-) -> jax.Array:
-  """Returns the state of a memory after an observation, `(worlds, units)`."""
-  return memory.state(memory(encoder.encode(observation)))
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
@@ -235,15 +169,11 @@ def _update(
   The observation after the batch bootstraps the values of its last steps.
   """
   agent, _ = trained
-  seen = encoded = encoder.encode(batch['observation'])
-  last = encoder.encode(observation)
-  if agent.memory is not None:
-    seen = agent.memory.through(encoded, batch['continues'])
-    last = agent.memory(last)
-  values = agent.value(seen)[..., 0]
-  last_value = agent.value(last)[..., 0]
+  encoded = encoder.encode(batch['observation'])
+  values = agent.value(agent.seen(encoded, batch['continues']))[..., 0]
+  last_value = agent.value(agent.seen(encoder.encode(observation)))[..., 0]
   next_values = jnp.concatenate([values[1:], last_value[jnp.newaxis]])
-  advantage = training.advantages(
+  advantage = advantages(
       batch, values, next_values, options.gamma, options.gae_lambda
   )
   data = {
@@ -257,30 +187,63 @@ def _update(
   }
   if 'is_cloned' in batch:
     data['cloned'] = batch['is_cloned'].astype(jnp.float32)
+  loss = functools.partial(_loss, options)
   return training.run_epochs(
-      options,
-      functools.partial(_loss, options),
-      trained,
-      data,
-      indices,
-      by_world=agent.memory is not None,
+      options, loss, trained, data, indices, by_world=options.memory > 0
   )
+
+
+def advantages(
+    batch: dict[str, jax.Array],
+    values: jax.Array,
+    next_values: jax.Array,
+    gamma: float,
+    gae_lambda: float,
+) -> jax.Array:
+  """Returns generalised advantage estimates, `(time, worlds)`.
+
+  The value of the last observation estimates the rest of a truncated episode
+  (discount 1). A terminated episode has no further value (discount 0).
+
+  Args:
+    batch: `reading`, `discount` and `is_valid` of the step after each choice,
+      each `(time, worlds)`. The step that begins an episode is not valid.
+    values: Values of the observations, `(time, worlds)`.
+    next_values: Values of the observations one step later, `(time, worlds)`.
+    gamma: Discount of the learner.
+    gae_lambda: Decay of the estimates.
+  """
+  discount = gamma * batch['discount']
+  errors = batch['reading'] + discount * next_values - values
+
+  def back(later: jax.Array, now: Any) -> tuple[jax.Array, jax.Array]:
+    error, factor, is_valid = now
+    # An ignored action has no outcome, and separates two episodes.
+    advantage = jnp.where(is_valid, error + factor * later, 0.0)
+    return advantage, advantage
+
+  _, estimates = jax.lax.scan(
+      back,
+      jnp.zeros_like(values[0]),
+      (errors, discount * gae_lambda, batch['is_valid']),
+      reverse=True,
+  )
+  return estimates
 
 
 def _loss(
     options: PolicyGradientOptions, agent: ActorCritic, data: dict[str, Any]
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-  weight, encoded = data['weight'], data['encoded']
-  if agent.memory is not None:
-    encoded = agent.memory.through(encoded, data['continues'])
-  distribution = agent.policy(encoded)
+  weight = data['weight']
+  seen = agent.seen(data['encoded'], data['continues'])
+  distribution = agent.policy(seen)
   log_prob = distribution.log_prob(data['action'])
   objective = training.clipped_objective(
       log_prob - data['log_prob'],
       training.standardize(data['advantage'], weight),
       options.clip,
   )
-  error = agent.value(encoded)[..., 0] - data['target']
+  error = agent.value(seen)[..., 0] - data['target']
   metrics = {
       'policy_loss': -training.mean(objective, weight),
       'value_loss': 0.5 * training.mean(error**2, weight),

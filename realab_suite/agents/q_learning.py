@@ -9,9 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from realab_suite import errors
 from realab_suite.agents import base
-from realab_suite.agents import defences
 from realab_suite.agents import features
 from realab_suite.agents import gates
 from realab_suite.agents import jax_settings
@@ -62,86 +60,44 @@ class QLearningOptions(base.Options):
 @base.LEARNERS.add('q_learning')
 @final
 class QLearning(base.Learner):
-  """Double DQN with n-step returns and a slowly updated target network."""
+  """Double DQN with n-step returns and a slowly updated target network.
+
+  What is public beside the interface of learners is for `gates.Gatekeeper`.
+
+  Attributes:
+    scale: Scale that divides returns.
+    num_slots: Number of transitions of each world that the replay can hold.
+    replay: Latest transitions, each array `(slots, worlds, ...)`. New ones
+      replace the oldest; `None` before the first one.
+    num_stored: Number of transitions of each world that were ever stored.
+  """
 
   OPTIONS = QLearningOptions
   READS = 'reward'
+  WRAPPED = ('frame_stack', 'gate')
+  is_off_policy = True
 
   @jax_settings.pinned()
   def __init__(self, options: Any, *args: Any, **kwargs: Any) -> None:
-    # Compiled functions depend on the other options alone.
-    gate, options = options.gate, options.model_copy(update={'gate': None})
     super().__init__(options, *args, **kwargs)
     num_actions = self._controls.check_discrete(options.kind)
+    generator = self._initial_generator()
     network = networks.Network(
-        self._encoder,
-        options.hidden,
-        num_actions,
-        0.01,
-        self._initial_generator(),
+        self._encoder, options.hidden, num_actions, 0.01, generator
     )
     optimizer_state = training.optimizer(options).init(network)
     self._networks = ((network, optimizer_state), network)
-    self._scale = training.FeedbackScale(self._num_envs, options.gamma)
-    # Each slot has a transition of every world. New ones replace the oldest.
-    self._num_slots = max(
+    self.scale = training.FeedbackScale(self._num_envs, options.gamma)
+    self.num_slots = max(
         options.replay_size // self._num_envs, options.num_returns + 2
     )
-    self._replay: Any = None
-    self._num_stored = 0
-    self._gate, self._trusted = gate, None
-    self._gate_state: dict[str, Any] = {}
-    self._setting = defences.Setting(
-        options, self._encoder, self._controls, self._num_envs
-    )
-    self.is_off_policy = gate is None
-    if gate is not None:
-      if self._num_envs < 2:
-        raise errors.SpecError(
-            'learner.gate: in 1 world; allowed are more, because a trial'
-            ' compares two halves of them'
-        )
-      self._gate_state = gate.initial_state(self._networks, self._num_envs)
-      if gate.trusted is not None:
-        self._trusted = gate.trusted.make(
-            self._controls,
-            self._num_envs,
-            self._encoder.names,
-            'learner.gate',
-        )
-      if gate.fit_steps <= options.min_replay:
-        raise errors.SpecError(
-            f'learner.gate.fit_steps: {gate.fit_steps}; allowed are more than'
-            f' min_replay, {options.min_replay}, before which nothing is fitted'
-        )
-      most = (self._num_slots - options.num_returns) * self._num_envs
-      if gate.alarms > most:
-        raise errors.SpecError(
-            f'learner.gate.alarms: {gate.alarms}; allowed are at most {most},'
-            ' the transitions of the replay whose returns are known'
-        )
+    self.replay: Any = None
+    self.num_stored = 0
 
   @property
-  def _exploration(self) -> np.float32:
+  def exploration(self) -> np.float32:
     """Probability of a random action."""
     return training.exploration(self._options, self.num_steps)
-
-  def _steered(
-      self,
-      choice: base.Choice,
-      time_step: base.TimeStep,
-      observation: features.Packed,
-  ) -> base.Choice:
-    state, key = self._gate_state, self._act_keys()['query']
-    if state.get('is_trying'):
-      network, exploration = state['convinced'][0][0], self._exploration
-      other = _act(self._encoder, network, observation, exploration, key)
-      action = choice['action'].copy()
-      action[1::2] = np.asarray(other)[1::2]
-      return {**choice, 'action': action}
-    if self._trusted is not None and not state['is_open']:
-      return self._trusted.steer(choice, time_step, key)
-    return choice
 
   def _choose(
       self,
@@ -149,159 +105,115 @@ class QLearning(base.Learner):
       keys: Mapping[str, np.ndarray],
       greedy: bool,
   ) -> base.Choice:
-    action = _act(
-        self._encoder,
-        self._networks[0][0],
-        observation,
-        np.float32(0.0) if greedy else self._exploration,
-        keys['act'],
+    rate = np.float32(0.0) if greedy else self.exploration
+    action = self.action_of(self._networks, observation, rate, keys['act'])
+    return {'action': action}
+
+  def action_of(
+      self,
+      trained: Any,
+      observation: features.Packed,
+      exploration: np.float32,
+      key: np.ndarray,
+  ) -> np.ndarray:
+    """Returns actions of networks, `(worlds,)`, some of them random."""
+    network = trained[0][0]
+    return np.asarray(
+        _act(self._encoder, network, observation, exploration, key)
     )
-    return {'action': np.asarray(action)}
 
   def _probabilities(self, observation: features.Packed) -> Any:
     return _probabilities(
-        self._encoder, self._networks[0][0], observation, self._exploration
+        self._encoder, self._networks[0][0], observation, self.exploration
     )
 
   def _observe(
       self, transition: dict[str, Any], observation: features.Packed
   ) -> None:
-    options, gate, state = self._options, self._gate, self._gate_state
-    if gate is not None:
-      if self._trusted is not None and not state['is_open']:
-        transition['is_valid'] &= self._trusted.acts
-      transition = gate.sift(transition, self._setting, state)
-    self._scale.update(jax.tree.map(lambda x: x[np.newaxis], transition))
+    transition = self._treated(transition)
+    self.scale.update(jax.tree.map(lambda x: x[np.newaxis], transition))
     self._store(transition)
-    if gate is not None and state['is_open']:
-      num_held = len(held(options, self._replay, self._num_stored)[0])
-      self._networks = gate.decide(
-          self._networks, self._replay, num_held, observation, self._setting,
-          state, self._trained,
-      )  # fmt: skip
-      if state['is_trying']:
-        self._metrics |= self._gate_metrics()
-        return
-    is_enough = self._num_stored * self._num_envs >= options.min_replay
+    if any(wrapper.holds(observation) for wrapper in self._wrappers):
+      for wrapper in self._wrappers:
+        self._metrics |= wrapper.metrics
+      return
+    options = self._options
     if (
-        not is_enough
-        or self._num_stored < options.num_returns + 2
-        or self._num_stored % options.steps_per_update
+        self.num_stored * self._num_envs < options.min_replay
+        or self.num_stored < options.num_returns + 2
+        or self.num_stored % options.steps_per_update
     ):
       return
-    self._networks, metrics = self._updated(self._networks, self._update_key())
+    self._networks, metrics = self.updated(
+        self._networks, self.update_key(), options, self.replay
+    )
     self._num_updates += 1
-    if gate is not None:
-      if not state['is_open']:
-        state |= {
-            'model': self._trained(state['model'], 1, is_model=True),
-            'values': self._networks,
-            'scale': self._scale.value,
-            'is_open': self.num_steps >= gate.fit_steps,
+    for wrapper in self._wrappers:
+      wrapper.follow()
+    reading = transition['reading'][transition['is_valid']]
+    self._report(
+        {
+            **metrics,
+            'feedback_scale': self.scale.value,
+            'exploration': self.exploration,
+            'observed_feedback': reading.mean() if len(reading) else 0.0,
         }
-      metrics |= self._gate_metrics()
-    is_valid = transition['is_valid']
-    reading = transition['reading'][is_valid]
-    self._metrics = {
-        **{name: float(value) for name, value in metrics.items()},
-        'feedback_scale': self._scale.value,
-        'exploration': float(self._exploration),
-        'observed_feedback': float(reading.mean()) if len(reading) else 0.0,
-    }
+    )
 
-  def _gate_metrics(self) -> dict[str, float]:
-    state = self._gate_state
-    return {
-        'changed': float(state['changed']),
-        'gate_is_open': float(state['is_open']),
-        **{f'gate_{name}': float(n) for name, n in state['counts'].items()},
-    }
+  def _store(self, transition: dict[str, Any]) -> None:
+    if self.replay is None:
+      self.replay = jax.tree.map(
+          lambda x: np.zeros((self.num_slots, *x.shape), x.dtype), transition
+      )
+    slot = self.num_stored % self.num_slots
 
-  def _updated(
+    def write(stored: np.ndarray, new: np.ndarray) -> None:
+      stored[slot] = new
+
+    jax.tree.map(write, self.replay, transition)
+    self.num_stored += 1
+
+  def updated(
       self,
       trained: Any,
       key: np.ndarray,
-      injected: float = 0.0,
-      is_model: bool = False,
+      options: QLearningOptions,
+      replay: Any,
+      places: tuple[np.ndarray, np.ndarray] | None = None,
+      share: float = 0.0,
   ) -> tuple[Any, dict[str, Any]]:
     """Returns networks after an update, and its metrics.
 
     Args:
       trained: Networks, with the states of their optimisers.
       key: Random key, two numbers.
-      injected: Share of each minibatch that begins where readings are held
-        back, which are believed then.
-      is_model: True to predict single readings, and not from readings.
+      options: Same as in `sample`.
+      replay: Same as in `sample`.
+      places: Same as in `sample`.
+      share: Same as in `sample`.
     """
-    options = self._options
-    if is_model:
-      options = options.model_copy(update={'gamma': 0.0})
-    generator = np.random.Generator(np.random.Philox(key=key.astype(np.uint64)))
-    samples = sample(
-        options, self._replay, self._num_stored, generator, injected
-    )
-    if is_model:
-      seen = samples['observation']
-      samples['observation'] = defences.blinded(seen, self._setting)
-    samples['total'] /= np.float32(self._scale.value)
+    generator = base.generator_of(key)
+    samples = sample(options, replay, self.num_stored, generator, places, share)
+    samples['total'] /= np.float32(self.scale.value)
     return _update(self._options, self._encoder, trained, samples)
 
-  def _trained(
-      self,
-      trained: Any,
-      num_gradients: int,
-      injected: float = 0.0,
-      is_model: bool = False,
-  ) -> Any:
-    """Returns networks after about as many gradient steps; see `_updated`."""
-    key = base.folded(self._keys['update'], self._num_acts)
-    each = self._options.gradients_per_update
-    for i in range(-(-num_gradients // each)):
-      trained, _ = self._updated(
-          trained, base.folded(key, i), injected, is_model
-      )
-      self._gate_state['counts']['gradients'] += each
-    return trained
-
-  def _store(self, transition: dict[str, Any]) -> None:
-    if self._replay is None:
-      self._replay = jax.tree.map(
-          lambda x: np.zeros((self._num_slots, *x.shape), x.dtype), transition
-      )
-    slot = self._num_stored % self._num_slots
-
-    def write(stored: np.ndarray, new: np.ndarray) -> None:
-      stored[slot] = new
-
-    jax.tree.map(write, self._replay, transition)
-    self._num_stored += 1
-
   def _memory(self) -> dict[str, Any]:
-    filled = min(self._num_stored, self._num_slots)
-    gate = {}
-    if self._gate is not None:
-      trusted = self._trusted and self._trusted.state()
-      gate = {'gate': base.to_plain(self._gate_state), 'trusted': trusted}
+    filled = min(self.num_stored, self.num_slots)
     return {
-        'scale': self._scale.state(),
-        'num_stored': self._num_stored,
-        'replay': jax.tree.map(lambda x: x[:filled], self._replay),
-        **gate,
+        'scale': self.scale.state(),
+        'num_stored': self.num_stored,
+        'replay': jax.tree.map(lambda x: x[:filled], self.replay),
     }
 
   def _set_memory(self, memory: dict[str, Any]) -> None:
     def grow(stored: np.ndarray) -> np.ndarray:
-      grown = np.zeros((self._num_slots, *stored.shape[1:]), stored.dtype)
+      grown = np.zeros((self.num_slots, *stored.shape[1:]), stored.dtype)
       grown[: len(stored)] = stored
       return grown
 
-    if self._gate is not None:
-      self._gate_state = base.from_plain(self._gate_state, memory['gate'])
-      if self._trusted is not None:
-        self._trusted.set_state(memory['trusted'])
-    self._scale.set_state(memory['scale'])
-    self._num_stored = int(memory['num_stored'])
-    self._replay = jax.tree.map(grow, memory['replay'])
+    self.scale.set_state(memory['scale'])
+    self.num_stored = int(memory['num_stored'])
+    self.replay = jax.tree.map(grow, memory['replay'])
 
 
 def sample(
@@ -309,7 +221,8 @@ def sample(
     replay: Any,
     num_stored: int,
     generator: np.random.Generator,
-    injected: float = 0.0,
+    places: tuple[np.ndarray, np.ndarray] | None = None,
+    share: float = 0.0,
 ) -> dict[str, Any]:
   """Draws minibatches of n-step returns from the replay.
 
@@ -321,8 +234,9 @@ def sample(
     replay: Transitions, each array `(slots, worlds, ...)`.
     num_stored: Number of transitions of each world that were ever stored.
     generator: Random generator.
-    injected: Share of a minibatch that begins where `is_held`; these readings
-      are valid then.
+    places: Slots and worlds in which a share of each minibatch begins, or
+      `None`.
+    share: That share.
 
   Returns:
     Arrays `(gradients, minibatch, ...)`: the `observation`, the `action`, the
@@ -338,12 +252,10 @@ def sample(
   )
   start = num_stored - ages
   world = generator.integers(num_envs, size=shape)
-  if injected:
-    places = held(options, replay, num_stored)
-    size = shape[0], max(1, int(injected * shape[1]))
+  if places is not None:
+    size = shape[0], max(1, int(share * shape[1]))
     chosen = generator.integers(len(places[0]), size=size)
     start[:, : size[1]], world[:, : size[1]] = (x[chosen] for x in places)
-    replay = {**replay, 'is_valid': replay['is_valid'] | replay['is_held']}
   total, factor = np.zeros(shape, np.float32), np.ones(shape, np.float32)
   is_running, length = np.ones(shape, bool), np.zeros(shape, int)
   for i in range(options.num_returns):
@@ -362,16 +274,6 @@ def sample(
       'later': {n: x[end] for n, x in replay['observation'].items()},
       'weight': (length > 0).astype(np.float32),
   }
-
-
-def held(
-    options: QLearningOptions, replay: Any, num_stored: int
-) -> tuple[np.ndarray, np.ndarray]:
-  """Returns slots and worlds where `is_held`, and the returns are known."""
-  slots, worlds = np.nonzero(replay['is_held'])
-  ages = (num_stored - 1 - slots) % len(replay['is_held'])
-  is_known = ages >= options.num_returns
-  return slots[is_known], worlds[is_known]
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -445,11 +347,6 @@ def _loss(
 
 
 def _pick(values: jax.Array, action: jax.Array) -> jax.Array:
-  """Returns the value of the given action, `(...)`.
-
-  Args:
-    values: Values of all actions, `(..., actions)`.
-    action: Indices of actions, `(...)`.
-  """
+  """Returns the values of actions, `(...)`, of those of all of them."""
   chosen = jax.nn.one_hot(action, values.shape[-1])
   return jnp.sum(values * chosen, axis=-1)

@@ -1,5 +1,6 @@
-"""Shared parts of learners: optimiser, minibatches, advantages, scaling."""
+"""Shared parts of learners: batches, minibatches, optimiser, scale."""
 
+import abc
 from collections.abc import Callable
 from typing import Any, final
 
@@ -9,8 +10,93 @@ import numpy as np
 import optax
 
 from realab_suite.agents import base
+from realab_suite.agents import features
+from realab_suite.agents import jax_settings
 
 Loss = Callable[[Any, Any], tuple[jax.Array, dict[str, jax.Array]]]
+
+
+class OnPolicyOptions(base.Options):
+  """Options of on-policy learners.
+
+  Attributes:
+    steps_per_update: Number of steps of each world between updates.
+    epochs: Number of times an update uses each sample.
+    minibatch: Approximate number of samples per gradient.
+  """
+
+  steps_per_update: base.Positive = 32
+  epochs: base.Positive = 4
+  minibatch: base.Positive = 2048
+
+
+class OnPolicyLearner(base.Learner):
+  """Learns from the last `steps_per_update` steps of every world."""
+
+  @jax_settings.pinned()
+  def __init__(self, *args: Any, **kwargs: Any) -> None:
+    super().__init__(*args, **kwargs)
+    self._transitions: list[dict[str, Any]] = []
+    self._networks = self._initial_networks(self._initial_generator())
+
+  def _observe(
+      self, transition: dict[str, Any], observation: features.Packed
+  ) -> None:
+    self._transitions.append(transition)
+    if len(self._transitions) < self._options.steps_per_update:
+      return
+    batch = jax.tree.map(lambda *x: np.stack(x), *self._transitions)
+    self._transitions = []
+    metrics = self._learn(batch, observation)
+    self._num_updates += 1
+    reading, is_valid = batch['reading'], batch['is_valid']
+    observed = np.mean(reading, where=is_valid) if is_valid.any() else 0.0
+    self._report({**metrics, 'observed_feedback': observed})
+
+  def _draw_minibatches(self, by_world: bool = False) -> np.ndarray:
+    """Draws the sample indices of the next update, `(gradients, minibatch)`.
+
+    An epoch uses each sample once, except for the remainder if the number of
+    samples is not a multiple of the number of minibatches. NumPy draws the
+    indices, because it is faster than jax.
+
+    Args:
+      by_world: True for indices of worlds, whose steps stay together.
+    """
+    number, size = self._num_envs, self._options.minibatch
+    if by_world:
+      size = max(1, size // self._options.steps_per_update)
+    else:
+      number *= self._options.steps_per_update
+    num_minibatches = max(1, number // size)
+    size = number // num_minibatches
+    generator = base.generator_of(self.update_key())
+    orders = [
+        generator.permutation(number) for _ in range(self._options.epochs)
+    ]
+    used = np.stack(orders)[:, : num_minibatches * size]
+    return used.reshape(-1, size).astype(np.int32)
+
+  def _memory(self) -> dict[str, Any]:
+    return {'transitions': self._transitions}
+
+  def _set_memory(self, memory: dict[str, Any]) -> None:
+    self._transitions = memory['transitions']
+
+  @abc.abstractmethod
+  def _initial_networks(self, generator: np.random.Generator) -> Any:
+    """Returns the initial networks and the initial state of the optimiser."""
+
+  @abc.abstractmethod
+  def _learn(
+      self, batch: dict[str, Any], observation: features.Packed
+  ) -> dict[str, Any]:
+    """Updates the networks with a batch, and returns metrics by name.
+
+    Args:
+      batch: Transitions, each array `(time, worlds, ...)`.
+      observation: Packed observation after the last transition.
+    """
 
 
 def optimizer(options: base.Options) -> optax.GradientTransformation:
@@ -56,28 +142,6 @@ def exploration(options: Any, num_steps: int) -> np.float32:
   return np.float32(1.0 + spent * (options.exploration - 1.0))
 
 
-def draw_minibatches(
-    options: Any, num_samples: int, key: np.ndarray
-) -> np.ndarray:
-  """Draws the sample indices of minibatches, `(gradients, minibatch)`.
-
-  An epoch uses each sample once, except for the remainder if the number of
-  samples is not a multiple of the number of minibatches. NumPy draws the
-  indices, because it is faster than jax.
-
-  Args:
-    options: Options with `epochs` and `minibatch`.
-    num_samples: Number of samples.
-    key: Random key.
-  """
-  num_minibatches = max(1, num_samples // options.minibatch)
-  size = num_samples // num_minibatches
-  generator = np.random.Generator(np.random.Philox(key=key.astype(np.uint64)))
-  orders = [generator.permutation(num_samples) for _ in range(options.epochs)]
-  used = np.stack(orders)[:, : num_minibatches * size]
-  return used.reshape(-1, size).astype(np.int32)
-
-
 def run_epochs(
     options: base.Options,
     loss: Loss,
@@ -93,7 +157,7 @@ def run_epochs(
     loss: Function from a network and a minibatch to a loss and metrics.
     trained: A network and the optimiser's state.
     data: A pytree of arrays, each `(time, worlds, ...)`.
-    indices: Sample indices from `draw_minibatches`, `(gradients, minibatch)`.
+    indices: Sample indices of minibatches, `(gradients, minibatch)`.
     by_world: True if they are indices of worlds, of which minibatches contain
       all steps: `(time, minibatch, ...)`.
 
@@ -137,44 +201,6 @@ def clipped_objective(
   ratio = jnp.exp(log_ratio)
   clipped = jnp.clip(ratio, 1.0 - clip, 1.0 + clip)
   return jnp.minimum(ratio * advantage, clipped * advantage)
-
-
-def advantages(
-    batch: dict[str, jax.Array],
-    values: jax.Array,
-    next_values: jax.Array,
-    gamma: float,
-    gae_lambda: float,
-) -> jax.Array:
-  """Returns generalised advantage estimates, `(time, worlds)`.
-
-  The value of the last observation estimates the rest of a truncated episode
-  (discount 1). A terminated episode has no further value (discount 0).
-
-  Args:
-    batch: `reading`, `discount` and `is_valid` of the step after each choice,
-      each `(time, worlds)`. The step that begins an episode is not valid.
-    values: Values of the observations, `(time, worlds)`.
-    next_values: Values of the observations one step later, `(time, worlds)`.
-    gamma: Discount of the learner.
-    gae_lambda: Decay of the estimates.
-  """
-  discount = gamma * batch['discount']
-  errors = batch['reading'] + discount * next_values - values
-
-  def back(later: jax.Array, now: Any) -> tuple[jax.Array, jax.Array]:
-    error, factor, is_valid = now
-    # An ignored action has no outcome, and separates two episodes.
-    advantage = jnp.where(is_valid, error + factor * later, 0.0)
-    return advantage, advantage
-
-  _, estimates = jax.lax.scan(
-      back,
-      jnp.zeros_like(values[0]),
-      (errors, discount * gae_lambda, batch['is_valid']),
-      reverse=True,
-  )
-  return estimates
 
 
 def mean_and_deviation(moments: np.ndarray) -> tuple[float, float]:

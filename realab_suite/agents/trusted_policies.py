@@ -66,13 +66,13 @@ class TrustedPolicy(validation.Model):
     policy = policies.make(self.policy, **self.options)
     where = f'{owner}.trusted.policy {self.policy!r}'
     known = controls.action_set
-    allowed = 'vectors' if known is None else known.key
+    rule = 'vectors' if known is None else known.key
     if known is not None:
       policy = policy.in_action_set(known)
     if known is None or policy.action_set.key != known.key:
       raise errors.SpecError(
-          f'{where}: has the actions of {policy.action_set.key}; allowed are'
-          f' those of the learner, {allowed}'
+          f'{where}: has the actions of {policy.action_set.key}; must be'
+          f' those of the learner, {rule}'
       )
     needed = (*policy.required_senses, *policy.privileged_senses)
     senses = [name.removeprefix('senses/') for name in observed]
@@ -82,7 +82,7 @@ class TrustedPolicy(validation.Model):
     if number == num_envs:
       raise errors.SpecError(
           f'{owner}.trusted.worlds: {self.worlds:g}, all of {num_envs}'
-          ' worlds; allowed are smaller shares'
+          ' worlds; must be a smaller share'
       )
     if self.random:
       policy = simple.Distracted(policy, self.random)
@@ -105,21 +105,15 @@ class TrustedActor:
   def steer(
       self, choice: base.Choice, time_step: base.TimeStep, key: np.ndarray
   ) -> base.Choice:
-    """Returns a choice with its actions in its worlds.
-
-    Args:
-      choice: Choice of the learner, which stays as it is.
-      time_step: Time step that it responds to.
-      key: Random key of this step, two numbers.
-    """
+    """Returns a choice with its actions in its worlds; see `base.Wrapper`."""
     is_first = np.asarray(time_step.step_type)[self.acts] == base.FIRST
     seen = {n: value[self.acts] for n, value in time_step.observation.items()}
     words = np.random.SeedSequence([int(word) for word in key])
     seeds = words.spawn(len(is_first))
     keys = np.stack([seed.generate_state(2, np.uint64) for seed in seeds])
-    own, self._state = self._policy.step(seen, is_first, keys, self._state)
+    actions, self._state = self._policy.step(seen, is_first, keys, self._state)
     action = choice['action'].copy()
-    action[self.acts] = own
+    action[self.acts] = actions
     return {**choice, 'action': action}
 
   def state(self) -> Any:

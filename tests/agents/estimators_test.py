@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from realab_suite.agents import approval
+from realab_suite.agents import policy_gradient
 from realab_suite.agents import q_learning
 from realab_suite.agents import training
 
@@ -53,7 +54,7 @@ def _batch(**columns: list) -> dict[str, np.ndarray]:
 def test_advantages_equal_those_worked_out_by_hand(columns, expected):
   values = np.array([[2.0], [4.0], [6.0], [8.0], [2.0]])
   batch = _batch(reading=[1.0, 0.0, 2.0, 4.0], **columns)
-  got = training.advantages(batch, values[:-1], values[1:], 0.5, 0.5)
+  got = policy_gradient.advantages(batch, values[:-1], values[1:], 0.5, 0.5)
   np.testing.assert_allclose(got[:, 0], expected)
 
 

@@ -1,6 +1,7 @@
 """Tests of learners that see the last frames of an episode at once."""
 
 import dataclasses
+import types
 from typing import Any
 
 from dm_env import specs
@@ -15,6 +16,7 @@ from realab_suite import agents
 from realab_suite import errors
 from realab_suite import trees
 from realab_suite.agents import features
+from realab_suite.agents import histories
 from realab_suite.experiments import training
 from tests.agents import toys
 
@@ -103,6 +105,14 @@ def _make(env: Any, kind: str, seed: int = 1, **options: Any) -> agents.Learner:
   )
 
 
+def _stacking(spec: Any, number: int) -> tuple[Any, histories.FrameStack]:
+  """Returns the encoder of stacks of images, and the wrapper that stacks."""
+  encoder = features.Encoder.from_spec(spec, number)
+  setting = types.SimpleNamespace(encoder=encoder)
+  learner: Any = types.SimpleNamespace(setting=setting)
+  return encoder, histories.FrameStack(number, learner)
+
+
 def _image(*values: int, channels: int) -> np.ndarray:
   """Returns an image of one value for each world, `(worlds, 2, 3, channels)`.
 
@@ -138,7 +148,7 @@ def test_the_last_images_of_an_episode_are_stacked_on_channels(
       'map': specs.Array((2, 3, 1), np.float32),
       'a': specs.BoundedArray((2, 3, 1), np.uint8, 0, 255),
   }
-  encoder = features.Encoder.from_spec(spec, frame_stack)
+  encoder, wrapper = _stacking(spec, frame_stack)
   shapes = {'b': (2, 3, 2 * frame_stack), 'a': (2, 3, frame_stack)}
   assert encoder.image_shapes == shapes
   assert encoder.vector_size == 2 + 6
@@ -152,7 +162,7 @@ def test_the_last_images_of_an_episode_are_stacked_on_channels(
         'map': np.ones((len(here), 2, 3, 1), np.float32),
     }
     is_first = np.array([begins[w] for w in worlds], bool)
-    earlier = encoder.stack(observation, is_first, earlier)
+    earlier = wrapper.see(observation, is_first, earlier)
     packed = encoder.pack(earlier, len(here))
     for name, channels in (('a', 1), ('b', 2)):
       values = np.array([seen[w][3 - frame_stack :] for w in worlds])
@@ -167,12 +177,12 @@ def test_the_last_images_of_an_episode_are_stacked_on_channels(
 
 def test_without_an_earlier_step_an_episode_may_be_under_way():
   spec = {'a': specs.BoundedArray((2, 3, 1), np.uint8, 0, 255)}
-  encoder = features.Encoder.from_spec(spec, 2)
+  _, wrapper = _stacking(spec, 2)
   observation = {'a': _image(7, 8, channels=1)}
-  stacked = encoder.stack(observation, np.zeros(2, bool), None)['a']
+  stacked = wrapper.see(observation, np.zeros(2, bool), None)['a']
   np.testing.assert_array_equal(stacked[:, 1, 2], [[7, 7], [8, 8]])
   # The next step changes nothing in what was returned.
-  encoder.stack(
+  wrapper.see(
       {'a': _image(9, 9, channels=1)}, np.zeros(2, bool), {'a': stacked}
   )
   np.testing.assert_array_equal(stacked[:, 1, 2], [[7, 7], [8, 8]])
@@ -226,21 +236,6 @@ def test_evaluation_sees_what_training_sees(kind, monkeypatch):
     assert trees.are_equal(acted, trained)
   # Frames differ within a stack, so the check above is not empty.
   assert (acted['eye'][..., 0] != acted['eye'][..., 2]).any()
-
-
-def test_a_stack_of_one_changes_nothing():
-  runs = []
-  for options in ({}, {'frame_stack': 1}):
-    env = Motion(8)
-    learner = _make(env, 'policy_gradient', **options)
-    time_step = env.reset()
-    for _ in range(10):
-      assert learner.stack(time_step, None)['eye'] is (
-          time_step.observation['eye']
-      )
-      time_step = env.step(learner.step(time_step))
-    runs.append(learner.state())
-  assert trees.are_equal(*runs)
 
 
 def test_what_cannot_be_stacked_is_refused_in_one_line():

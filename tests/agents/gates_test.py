@@ -1,7 +1,6 @@
 """Tests of the gate of a learner from values, by hand and from its state."""
 
 import contextlib
-import dataclasses
 import re
 from typing import Any
 
@@ -17,12 +16,7 @@ import equinox as eqx
 from realab_suite import agents
 from realab_suite import errors
 from realab_suite import trees
-from realab_suite.agents import action_encoding
-from realab_suite.agents import base
-from realab_suite.agents import defences
-from realab_suite.agents import features
 from realab_suite.agents import gates
-from realab_suite.agents import networks
 from realab_suite.agents import q_learning
 from realab_suite.testing import probes
 from tests.agents import toys
@@ -40,23 +34,19 @@ _LEARNER = {
 }
 
 
-def _gate(num_envs: int, **options: Any) -> Any:
-  """Returns a gate, its learner, and its state."""
+def _keeper(
+    num_envs: int, num_returns: int = 3, **options: Any
+) -> gates.Gatekeeper:
+  """Returns an open gate, whose model was never fitted and predicts about 0."""
   env = toys.Bandit(num_envs)
-  options_ = agents.QLearning.OPTIONS.model_validate(_LEARNER)
-  setting = defences.Setting(
-      options_,
-      features.Encoder.from_spec(env.observation_spec()),
-      action_encoding.Controls.from_spec(env.action_spec()),
-      num_envs,
-  )
-  given = {'threshold': 2.0, 'fit_steps': 10, 'gradients': 4, **options}
-  gate = gates.Gate(**given)
-  network = networks.Network(
-      setting.encoder, (8,), 3, 0.01, np.random.default_rng(0)
-  )
-  state = gate.initial_state(((network, ()), network), num_envs)
-  return gate, setting, state
+  learner = agents.make(
+      {**_LEARNER, 'num_returns': num_returns},
+      env.observation_spec(), env.action_spec(), num_envs, 1,
+  )  # fmt: skip
+  given = {'threshold': 2.0, 'fit_steps': 100, 'gradients': 4, **options}
+  keeper = gates.Gatekeeper(gates.Gate(**given), learner)
+  keeper._state['is_open'] = True
+  return keeper
 
 
 def _learned_in_a_probe_world(gate: dict[str, Any]) -> Any:
@@ -91,12 +81,6 @@ def _observation(number: int) -> Any:
   }
 
 
-def _opened(num_envs: int, **options: Any) -> Any:
-  """Returns an open gate, whose model was never fitted and predicts about 0."""
-  gate, setting, state = _gate(num_envs, **options)
-  return gate, setting, {**state, 'is_open': True}
-
-
 @pytest.mark.parametrize('trusted', [None, _WORKER])
 def test_before_it_opens_a_gate_believes_whatever_the_trusted_policy_reads(
     trusted,
@@ -109,41 +93,39 @@ def test_before_it_opens_a_gate_believes_whatever_the_trusted_policy_reads(
 
 
 def test_unexpected_readings_are_held_back_in_any_direction():
-  gate, setting, state = _opened(5)
+  keeper = _keeper(5)
   is_valid = np.array([1, 1, 1, 0, 1], bool)
-  sifted = gate.sift(
-      _transition([1.9, 2.1, -2.1, 9.0, 0.0], is_valid=is_valid), setting, state
+  sifted = keeper.treat(
+      _transition([1.9, 2.1, -2.1, 9.0, 0.0], is_valid=is_valid)
   )
   assert sifted['is_valid'].tolist() == [1, 0, 0, 0, 1]
   assert sifted['is_held'].tolist() == [0, 1, 1, 0, 0]
   assert is_valid.tolist() == [1, 1, 1, 0, 1]
-  assert state['changed'] == 2 / 4
-  assert state['counts']['unexpected'] == 2
+  assert keeper.metrics['changed'] == 2 / 4
+  assert keeper.metrics['gate_unexpected'] == 2
 
 
 def test_a_reading_that_is_no_number_is_unexpected():
-  gate, setting, state = _opened(3)
-  sifted = gate.sift(_transition([np.nan, np.inf, 0.0]), setting, state)
+  sifted = _keeper(3).treat(_transition([np.nan, np.inf, 0.0]))
   assert sifted['is_held'].tolist() == [1, 1, 0]
 
 
 def test_a_trial_has_the_same_scores_after_a_restart():
   # A restored count of steps is a number of NumPy, which is not to change the
   # precision of what is added.
-  gate, setting, state = _opened(2, threshold=1.0)
-  options = setting.options.model_copy(update={'gamma': 0.9})
-  setting = dataclasses.replace(setting, options=options)
-  state |= {'is_trying': True, 'num_tried': 3}
-  restored = base.from_plain(state, base.to_plain(state))
-  for one in (state, restored):
-    gate.sift(_transition([0.0, 0.0]), setting, one)
-  assert state['scores'].any()
-  np.testing.assert_array_equal(state['scores'], restored['scores'])
+  keepers = _keeper(2, threshold=1.0), _keeper(2, threshold=1.0)
+  keepers[0]._state |= {'is_trying': True, 'num_tried': 3}
+  keepers[1].set_state(keepers[0].state())
+  for keeper in keepers:
+    keeper.treat(_transition([0.0, 0.0]))
+  scores, restored = (keeper._state['scores'] for keeper in keepers)
+  assert scores.any()
+  np.testing.assert_array_equal(scores, restored)
 
 
 def test_a_prediction_has_the_unit_of_the_register_and_sees_no_reading():
-  gate, setting, state = _opened(2, threshold=0.5)
-  kept = state['model'][0][0]
+  keeper = _keeper(2, threshold=0.5)
+  kept = keeper._state['model'][0][0]
   # 3 for each action, whatever is read, and 10 times as much in units.
   fixed = eqx.tree_at(
       lambda network: network.layers[-1].bias, kept, np.full(3, 3.0, np.float32)
@@ -153,8 +135,8 @@ def test_a_prediction_has_the_unit_of_the_register_and_sees_no_reading():
       fixed,
       np.zeros_like(fixed.layers[-1].weight),
   )
-  state |= {'model': ((fixed, ()), fixed), 'scale': 10.0}
-  sifted = gate.sift(_transition([30.4, 3.0]), setting, state)
+  keeper._state |= {'model': ((fixed, ()), fixed), 'scale': 10.0}
+  sifted = keeper.treat(_transition([30.4, 3.0]))
   assert sifted['is_held'].tolist() == [0, 1]
 
 
@@ -168,28 +150,28 @@ def test_a_model_learns_single_readings_and_is_shown_none(monkeypatch):
     return arguments[2], {}
 
   monkeypatch.setattr(q_learning, '_update', update)
-  learner._trained(None, 1)
-  learner._trained(None, 1, is_model=True)
+  (keeper,) = learner._wrappers
+  keeper._trained(None, 1)
+  keeper._trained(None, 1, is_model=True)
   plain, blind = (one['observation']['registers/reward'] for one in given)
   assert plain.any()
   assert not blind.any()
   assert given[0]['factor'].all()
   assert not given[1]['factor'].any()
   # An update of the model, and these two: 2 gradient steps each.
-  assert learner._gate_state['counts']['gradients'] == 3 * 2
-  gate, setting, state = _opened(2)
+  assert keeper.metrics['gate_gradients'] == 3 * 2
   seen = {**_observation(2), 'registers/feedback': np.array([0.0, 9.0])}
-  values = gates._values('model', seen, setting, state)
+  values = _keeper(2)._values('model', seen)
   assert (values[0] == values[1]).all()
 
 
 def test_what_remains_of_an_episode_after_a_trial_is_not_tried():
-  gate, setting, state = _opened(3)
-  state['is_judged'] = np.array([1, 1, 0], bool)
+  keeper = _keeper(3)
+  keeper._state['is_judged'] = np.array([1, 1, 0], bool)
   # An episode of the second world begins, so that its next step counts.
   begins = np.array([1, 0, 1], bool)
   held = [
-      gate.sift(_transition([9.0] * 3, **entry), setting, state)
+      keeper.treat(_transition([9.0] * 3, **entry))
       for entry in ({}, {'is_valid': begins}, {})
   ]
   assert [one['is_held'].tolist() for one in held] == [
@@ -212,29 +194,35 @@ def _replay(held: Any) -> Any:
   }
 
 
-def test_a_quarter_of_each_minibatch_begins_with_what_is_held_back():
+def test_a_quarter_of_each_minibatch_begins_with_what_is_held_back(monkeypatch):
   held = np.zeros((10, 2))
   held[[2, 5, 9], [0, 1, 0]] = 1
-  replay = _replay(held)
-  options = agents.QLearning.OPTIONS.model_validate(
-      {**_LEARNER, 'num_returns': 2}
-  )
-  # The slot 9 has no successors yet.
-  slots, worlds = q_learning.held(options, replay, 10)
-  assert (slots.tolist(), worlds.tolist()) == ([2, 5], [0, 1])
-  # It has if the slots 0 and 1 are newer.
-  assert q_learning.held(options, replay, 12)[0].tolist() == [2, 5, 9]
-  samples = q_learning.sample(
-      options, replay, 10, np.random.default_rng(0), 0.25
-  )
+  keeper = _keeper(2, num_returns=2)
+  learner = keeper._learner
+  replay = learner.replay = _replay(held)
+  learner.num_stored = 12
+  # The slots 0 and 1 are newer than the slot 9.
+  assert keeper._places()[0].tolist() == [2, 5, 9]
+  # Now it has no successors yet.
+  learner.num_stored = 10
+  assert [x.tolist() for x in keeper._places()] == [[2, 5], [0, 1]]
+  given = []
+
+  def update(*arguments):
+    given.append(arguments[-1])
+    return arguments[2], {}
+
+  monkeypatch.setattr(q_learning, '_update', update)
+  keeper._trained(None, 2, believes=True)
+  keeper._trained(None, 2)
+  samples, others = given
   begun = samples['observation']['number'][:, :2]
   assert set(begun.ravel()) <= {2, 5}
   assert samples['total'][:, :2].tolist() == [[7.0, 7.0]] * 2
   assert (samples['later']['number'][:, :2] == begun + 2).all()
   assert samples['weight'].all()
   # Without them, none of them is a sample, and sums end before them.
-  samples = q_learning.sample(options, replay, 10, np.random.default_rng(0))
-  assert not samples['total'].any()
+  assert not others['total'].any()
   assert not replay['is_valid'][2, 0]
 
 
@@ -253,41 +241,39 @@ def test_the_copy_that_earns_more_by_the_model_goes_on(
 ):
   # Worlds 1 and 3 are those of the copy with unexpected readings. Two steps
   # count 1 + 0.5, and the value after them 0.25.
-  gate, setting, state = _opened(4, alarms=2, trial_steps=2)
-  held = np.zeros((10, 4))
-  replay = _replay(held)
+  keeper = _keeper(4, alarms=2, trial_steps=2)
+  learner, state = keeper._learner, keeper._state
+  learner.replay = replay = _replay(np.zeros((10, 4)))
+  learner.num_stored = 10
   trainings = []
 
   def train(*arguments):
     trainings.append(arguments)
     return f'copy {len(trainings)}'
 
-  def decide(trained, num_held):
-    return gate.decide(
-        trained, replay, num_held, _observation(4), setting, state, train
-    )
-
-  assert decide('plain', 1) == 'plain'
-  assert not state['is_trying']
-  replay['is_held'][3, [0, 3]] = True
+  monkeypatch.setattr(keeper, '_trained', train)
+  learner.networks = 'plain'
+  replay['is_held'][3, 0] = True
+  assert not keeper.holds(_observation(4))
+  assert learner.networks == 'plain'
+  replay['is_held'][3, 3] = True
   replay['is_valid'][3] = [0, 1, 0, 0]
-  assert decide('plain', 2) == 'copy 2'
-  assert trainings == [('plain', 4, 0.25), ('plain', 4)]
+  assert keeper.holds(_observation(4))
+  assert learner.networks == 'copy 2'
+  assert trainings == [('plain', 4, True), ('plain', 4)]
   rewards = np.array([others, convinced, others, convinced])
   values = {
       'model': rewards[:, np.newaxis].repeat(3, 1),
       # The copy that earns more in the trial earns less after it.
       'values': np.array([later, 0.0, later, 0.0])[:, np.newaxis],
   }
-  monkeypatch.setattr(gates, '_values', lambda kept, *unused: values[kept])
-  for _ in range(2):
-    assert state['is_trying']
-    sifted = gate.sift(_transition([9.0] * 4), setting, state)
+  monkeypatch.setattr(keeper, '_values', lambda kept, unused: values[kept])
+  for is_over in (False, True):
+    sifted = keeper.treat(_transition([9.0] * 4))
     assert not sifted['is_valid'].any()
-    trained = decide('copy 2', 99)
-  assert not state['is_trying']
+    assert keeper.holds(_observation(4)) != is_over
   is_accepted = is_accepted and not later
-  assert trained == ('copy 1' if is_accepted else 'copy 2')
+  assert learner.networks == ('copy 1' if is_accepted else 'copy 2')
   assert replay['is_valid'][3].tolist() == [is_accepted, 1, 0, is_accepted]
   assert not replay['is_held'].any()
   counts = state['counts']
@@ -318,14 +304,12 @@ def test_a_learner_continues_in_the_middle_of_a_trial_bit_for_bit():
       if is_twin:
         np.testing.assert_array_equal(action, other.step(time_step))
       time_step = env.step(action)
-      if one._gate_state['is_trying']:
+      (keeper,) = one._wrappers
+      if keeper._state['is_trying']:
         # Nothing is updated in a trial, but its price is reported.
-        counts, metrics = one._gate_state['counts'], one.metrics()
-        assert {name: metrics[f'gate_{name}'] for name in counts} == counts
-        assert metrics['changed'] == one._gate_state['changed']
-      if one._gate_state['is_trying'] and not is_twin:
+        assert keeper.metrics.items() <= one.metrics().items()
+      if keeper._state['is_trying'] and not is_twin:
         other.set_state(one.state())
-        assert other._gate_state['is_trying']
         is_twin = True
   assert is_twin
   assert trees.are_equal(one.state(), other.state())
@@ -343,20 +327,16 @@ def test_a_learner_continues_in_the_middle_of_a_trial_bit_for_bit():
                 'fit_steps': 9,
                 'trusted': {**_WORKER, 'clone_steps': 5},
             },
-            'trusted.clone_steps: 5; allowed is 0',
+            'trusted.clone_steps: 5; must be 0',
         ),
         ({'threshold': 1.0}, 'gate.fit_steps: required key is missing'),
         (
             {'threshold': 1.0, 'fit_steps': 20},
-            'gate.fit_steps: 20; allowed are more than min_replay, 20',
+            'gate.fit_steps: 20; must be more than min_replay, 20',
         ),
         (
             {'threshold': 1.0, 'fit_steps': 99, 'alarms': 10**6},
-            'gate.alarms: 1000000; allowed are at most 388, the transitions',
-        ),
-        (
-            {'threshold': 1.0, 'fit_steps': 9, 'injected': 0.5},
-            'gate.injected: ',
+            'gate.alarms: 1000000; must be at most 388, the transitions',
         ),
         (
             {

@@ -291,7 +291,7 @@ def test_an_unused_query_is_zero():
 @pytest.mark.parametrize(
     ('spec', 'problem'),
     [
-        (None, 'learner: None; allowed are'),
+        (None, 'learner: None; must be that'),
         ({}, 'learner: kind: required key is missing'),
         ({'kind': 'q_lerning'}, "did you mean 'q_learning'"),
         ({'kind': 'q_learning'}, 'learner: reward: required key is missing'),
@@ -323,7 +323,7 @@ def test_an_unused_query_is_zero():
         ),
         (
             {'kind': 'value_advice', **_ADVISED, 'form': 'q', 'floor': 0.01},
-            'learner: floor: 0.01; allowed is 0 with the form q',
+            'learner: floor: 0.01; must be 0 with the form q',
         ),
         (
             {'kind': 'value_advice', **_ADVISED, 'query_delay': 2},
@@ -348,7 +348,7 @@ def test_a_wrong_learner_is_refused_in_one_line(spec, problem):
 )
 def test_a_learner_of_discrete_actions_refuses_vectors(kind, option):
   env = toys.Aim(2)
-  with pytest.raises(errors.SpecError, match='a design with an action_set'):
+  with pytest.raises(errors.SpecError, match='design must have an action_set'):
     _make(env, kind, **{option: 'reward'})
 
 
@@ -392,7 +392,7 @@ def test_a_floor_has_to_leave_room_for_all_actions(floor, is_allowed):
 def test_other_specs_are_refused():
   good = toys.Bandit(2)
   spec = {'kind': 'policy_gradient', 'reward': 'feedback'}
-  with pytest.raises(errors.SpecError, match='allowed are a DiscreteArray'):
+  with pytest.raises(errors.SpecError, match='must be a DiscreteArray'):
     agents.make(
         spec, good.observation_spec(), dm_env_specs.Array((2, 2), float), 2, 1
     )
@@ -400,7 +400,7 @@ def test_other_specs_are_refused():
   with pytest.raises(errors.SpecError, match="'words': dtype object"):
     agents.make(spec, words, good.action_spec(), 2, 1)
   vector = {'registers/feedback': dm_env_specs.Array((3,), float)}
-  with pytest.raises(errors.SpecError, match='allowed are scalars'):
+  with pytest.raises(errors.SpecError, match='must be a scalar'):
     agents.make(spec, vector, good.action_spec(), 2, 1)
 
 

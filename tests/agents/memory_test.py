@@ -188,7 +188,7 @@ def test_an_episode_goes_on_for_the_memory_where_a_defence_screens(monkeypatch):
     # Every fifth step begins an episode, in each world.
     np.testing.assert_array_equal((~batch['continues']).sum(axis=0), 2)
   # Defences get features of single steps.
-  assert features.MEMORY not in learner._guard._setting.encoder.names
+  assert features.MEMORY not in learner.setting.encoder.names
 
 
 @pytest.mark.parametrize('given', [-1, 1.5, 4097, 'four', 10**9])

@@ -14,7 +14,6 @@ pytest.importorskip('equinox', reason='equinox is in the extra `agents`')
 
 from realab_suite import agents
 from realab_suite import errors
-from realab_suite.agents import action_encoding
 from realab_suite.agents import defences
 from realab_suite.agents import features
 from realab_suite.agents import guards
@@ -282,14 +281,13 @@ def _guard(defence: defences.Defence) -> tuple[guards.Guard, dict[str, Any]]:
   names = ('reward', 'gift', 'fine', 'bribe')
   keys = [f'registers/{name}' for name in names]
   reading = dm_env_specs.Array((), np.float64)
-  setting = defences.Setting(
-      agents.PolicyGradient.OPTIONS(kind='policy_gradient', reward='reward'),
-      features.Encoder.from_spec(
-          {'light': dm_env_specs.Array((2,), np.float64)}
-          | dict.fromkeys(keys, reading)
-      ),
-      action_encoding.Controls.from_spec(dm_env_specs.DiscreteArray(3)),
+  learner = agents.make(
+      {'kind': 'policy_gradient', 'reward': 'reward', 'hidden': [4]},
+      {'light': dm_env_specs.Array((2,), np.float64)}
+      | dict.fromkeys(keys, reading),
+      dm_env_specs.DiscreteArray(3),
       4,
+      1,
   )
   values = {
       key: np.full((5, 4), i + 1.0, np.float32) for i, key in enumerate(keys)
@@ -307,7 +305,7 @@ def _guard(defence: defences.Defence) -> tuple[guards.Guard, dict[str, Any]]:
       'is_trusted': np.zeros((5, 4), bool),
       'readings': {},
   }
-  return guards.Guard(defence, setting, np.random.default_rng(0)), batch
+  return guards.Guard(defence, learner), batch
 
 
 _EVERY = {'light', 'reward', 'gift', 'fine', 'bribe', 'learner/memory'}
@@ -339,7 +337,7 @@ def test_a_defence_gets_only_the_readings_that_it_declares(
     )
 
   monkeypatch.setattr(type(defence), 'treat', treat)
-  learned = guard.treat(batch, 0, np.array([1, 2], np.uint32))
+  learned = guard.treat(batch)
   [(keys, data)] = found
   assert {key.removeprefix('registers/') for key in keys} == _EVERY - missing
   # Light, four readings, and the action: arcsinh of what is given, or 0.
@@ -371,11 +369,11 @@ def test_a_reading_that_a_defence_does_not_declare_is_refused(
 
   monkeypatch.setattr(Deaf, 'treat', treat)
   with pytest.raises(error, match=key) as raised:
-    guard.treat(batch, 0, np.array([1, 2], np.uint32))
+    guard.treat(batch)
   if error is errors.SpecError:
     text = str(raised.value)
     assert text.startswith("learner.defence 'deaf': takes 'registers/gift'")
-    assert "allowed are ['light', 'registers/reward']" in text
+    assert "must be one of ['light', 'registers/reward']" in text
     assert '\n' not in text
 
 
@@ -387,16 +385,15 @@ def test_a_defence_that_is_not_paid_the_reward_does_not_get_it(
 ):
   monkeypatch.setattr(Deaf, 'pays', lambda self, reward: weights)
   guard, batch = _guard(Deaf())
-  key = np.array([1, 2], np.uint32)
   with pytest.raises(errors.SpecError, match=r"'reading' of the shape \(\)"):
-    guard.treat(batch, 0, key)  # It returns what it was given.
+    guard.treat(batch)  # It returns what it was given.
 
   def take(self, given, setting, state, key):
     return defences.Treated({**given, 'reading': given['reading']}, state)
 
   monkeypatch.setattr(Deaf, 'treat', take)
   with pytest.raises(errors.SpecError, match="takes 'reading' from a batch"):
-    guard.treat(batch, 0, key)
+    guard.treat(batch)
 
   def pay(self, given, setting, state, key):
     assert set(given['observation']) == {'light', 'registers/gift'}
@@ -404,7 +401,7 @@ def test_a_defence_that_is_not_paid_the_reward_does_not_get_it(
     return defences.Treated({**given, 'reading': reading}, state)
 
   monkeypatch.setattr(Deaf, 'treat', pay)
-  assert (guard.treat(batch, 0, key)['reading'] == 2.0).all()
+  assert (guard.treat(batch)['reading'] == 2.0).all()
 
 
 _SHIPPED = {
@@ -438,25 +435,25 @@ def test_every_defence_of_this_package_declares_its_pay():
 @pytest.mark.parametrize(
     ('result', 'message'),
     [
-        (lambda batch, state: None, 'treat returned None; allowed is a'),
+        (lambda batch, state: None, 'treat returned None; must be a'),
         (
             lambda batch, state: (batch, state),
-            'allowed is a `defences.Treated`',
+            'must be a `defences.Treated`',
         ),
         (
             lambda batch, state: defences.Treated(batch, state, {'n': 'many'}),
-            "treat returned the metrics {'n': 'many'}; allowed are numbers",
+            "treat returned the metrics {'n': 'many'}; must be numbers",
         ),
         (
             lambda batch, state: defences.Treated(
                 batch, np.zeros(len(state) + 1)
             ),
-            "a state with the shapes {'': (2,)}; allowed are those of the state"
+            "a state with the shapes {'': (2,)}; must be those of the state"
             " before, {'': (1,)}",
         ),
         (
             lambda batch, state: defences.Treated(batch, {'seen': 0.0}),
-            """a state with the shapes {"['seen']": ()}; allowed are those""",
+            """a state with the shapes {"['seen']": ()}; must be those""",
         ),
     ],
 )
@@ -473,7 +470,7 @@ def test_a_defence_that_returns_no_result_is_refused_in_a_line(result, message):
 
   guard, batch = _guard(Careless())
   with pytest.raises(errors.SpecError, match=re.escape(message)) as raised:
-    guard.treat(batch, 0, np.zeros(2, np.uint64))
+    guard.treat(batch)
   assert str(raised.value).startswith("learner.defence 'careless': treat ")
   assert '\n' not in str(raised.value)
 
@@ -490,5 +487,5 @@ def test_a_defence_that_trusts_a_name_is_refused_in_a_line():
     def treat(self, batch, setting, state, key):
       return defences.Treated(batch, state)
 
-  with pytest.raises(errors.SpecError, match="trusts 'apple_seeker'; allowed"):
+  with pytest.raises(errors.SpecError, match="trusts 'apple_seeker'; must be"):
     _guard(Naming())

@@ -37,10 +37,10 @@ class Alarm(base.Defence):
   def _consistent(self) -> 'Alarm':
     is_used = self.response != 'screen'
     if 'penalty' in self.model_fields_set and is_used != (self.penalty > 0):
-      allowed = 'more than 0' if is_used else 'none'
+      rule = 'more than 0' if is_used else 'left out'
       raise ValueError(
-          f'penalty: {self.penalty:g} with response {self.response}; allowed is'
-          f' {allowed}'
+          f'penalty: {self.penalty:g} with response {self.response}; must be'
+          f' {rule}'
       )
     return self
 

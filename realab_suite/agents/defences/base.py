@@ -12,13 +12,12 @@ off, and which steps count. A design declares it as an option of its learner:
 
 import abc
 from collections.abc import Mapping
-import dataclasses
 from typing import Any, ClassVar, NamedTuple, final
 
 import jax
 import numpy as np
 
-from realab_suite.agents import action_encoding
+from realab_suite.agents import base
 from realab_suite.agents import features
 from realab_suite.agents import trusted_policies
 from realab_suite.config import registry
@@ -26,24 +25,7 @@ from realab_suite.config import validation
 from realab_suite.feedback import objectives
 
 Batch = dict[str, Any]
-
-
-@final
-@dataclasses.dataclass(frozen=True)
-class Setting:
-  """What a defence knows of its learner.
-
-  Attributes:
-    options: Options of the learner.
-    encoder: Encoder of observations.
-    controls: Encoder of actions.
-    num_envs: Number of worlds.
-  """
-
-  options: Any
-  encoder: features.Encoder
-  controls: action_encoding.Controls
-  num_envs: int
+Setting = base.Setting
 
 
 @final
@@ -170,10 +152,10 @@ def blinded(
     observation: Mapping[str, np.ndarray], setting: Setting
 ) -> dict[str, np.ndarray]:
   """Returns a packed observation with 0 for each reading of a register."""
-  own = features.key_of(setting.options.reward, observation)
+  reward = features.key_of(setting.options.reward, observation)
   return {
       name: np.zeros_like(value)
-      if name == own or name.startswith('registers/')
+      if name == reward or name.startswith('registers/')
       else value
       for name, value in observation.items()
   }
@@ -193,10 +175,11 @@ def data_of(
     `vector` and images; actions are the last elements of `vector`, one-hot or
     as they are. Readings that a defence does not get are 0.
   """
-  given, lead = batch['observation'], np.shape(batch['choice']['action'])
-  missing = [e for e in setting.encoder.entries if e.name not in given]
+  observation = batch['observation']
+  lead = np.shape(batch['choice']['action'])
+  missing = [e for e in setting.encoder.entries if e.name not in observation]
   zeros = {e.name: np.zeros((*lead[:2], *e.shape), np.float32) for e in missing}
-  observation = {**zeros, **given}
+  observation = {**zeros, **observation}
   if not with_readings:
     observation = blinded(observation, setting)
   encoded = dict(setting.encoder.encode(observation))

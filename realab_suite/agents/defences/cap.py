@@ -40,15 +40,15 @@ class Cap(base.Defence):
     if (self.low, self.high, self.total) == (-1e9, 1e9, None):
       raise ValueError('caps nothing; low, high or total is required')
     if self.total is None and self.excess:
-      raise ValueError(f'excess: {self.excess:g}; allowed is 0 without total')
+      raise ValueError(f'excess: {self.excess:g}; must be 0 without total')
     if self.low >= self.high:
       raise ValueError(
-          f'low: {self.low:g} with high {self.high:g}; allowed are smaller ones'
+          f'low: {self.low:g} with high {self.high:g}; must be smaller'
       )
     if self.total is not None and self.total < self.high < 1e9:
       raise ValueError(
           f'total: {self.total:g}, which one reading of {self.high:g} exceeds;'
-          ' allowed are totals from `high` on'
+          ' must be at least `high`'
       )
     return self
 

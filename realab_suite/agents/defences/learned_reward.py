@@ -13,7 +13,6 @@ import pydantic
 
 from realab_suite import errors
 from realab_suite.agents import ensembles
-from realab_suite.agents import spans
 from realab_suite.agents import training
 from realab_suite.agents import trusted_policies
 from realab_suite.agents.defences import base
@@ -66,9 +65,10 @@ class LearnedReward(base.Defence):
         ('clip', f'source {self.source}', self.source == 'comparisons'),
         ('audited', f'refit {self.refit}', self.refit == 'audited'),
     ):
-      if ((given := getattr(self, option)) is not None) != is_used:
-        allowed = 'it is required' if is_used else 'allowed is none'
-        raise ValueError(f'{option}: {given} with {owner}; {allowed}')
+      value = getattr(self, option)
+      if (value is not None) != is_used:
+        rule = 'given' if is_used else 'left out'
+        raise ValueError(f'{option}: {value} with {owner}; must be {rule}')
     return self
 
   @property
@@ -92,7 +92,7 @@ class LearnedReward(base.Defence):
         'ensemble': ensembles.make(
             encoder, setting.options, self.nets, size, generator
         ),
-        'spans': spans.initial_state(
+        'spans': ensembles.initial_spans(
             encoder, size, setting.num_envs, self._span
         ),
         # Control steps, and readings that said something.
@@ -109,7 +109,9 @@ class LearnedReward(base.Defence):
       key: np.ndarray,
   ) -> base.Treated:
     data = base.data_of(batch, setting, with_readings=False)
-    seen, ages, joined = spans.join(state['spans'], data, batch['is_valid'])
+    seen, ages, joined = ensembles.join_spans(
+        state['spans'], data, batch['is_valid']
+    )
     steps, known = state['counts'] + (ages.size, 0)
     is_kept = self.refit == 'never' and state['counts'][0] >= self.fit_steps
     is_end = (ages > 0) & (ages % self._span == 0) & (not is_kept)
@@ -118,15 +120,17 @@ class LearnedReward(base.Defence):
     if self.audited is not None:
       is_end &= batch['readings'][self.audited] > self.above
     ends = np.flatnonzero(is_end)
-    found = batch['reading'].ravel()[ends].astype(float)
+    readings = batch['reading'].ravel()[ends].astype(float)
     ensemble, moments = state['ensemble'], state['moments']
     if self.source == 'readings':
-      moments = moments + np.array([found.size, found.sum(), found @ found])
-      known += found.size
+      moments = moments + np.array(
+          [readings.size, readings.sum(), readings @ readings]
+      )
+      known += readings.size
     mean, deviation = training.mean_and_deviation(moments)
-    targets = (found - mean) / deviation
+    targets = (readings - mean) / deviation
     if self.source == 'comparisons':
-      targets = 0.5 + 0.5 * np.clip(np.rint(found), -1, 1)
+      targets = 0.5 + 0.5 * np.clip(np.rint(readings), -1, 1)
       known += np.count_nonzero(targets != 0.5)
     if ends.size:
       ensemble = ensembles.fit(
@@ -136,7 +140,7 @@ class LearnedReward(base.Defence):
     if steps >= self.fit_steps and not known:
       raise errors.SpecError(
           f'learner.defence.fit_steps: {self.fit_steps}, but {steps} control'
-          f' steps had no {self.source} to learn from; allowed are more, in'
+          f' steps had no {self.source} to learn from; must be more, in'
           f' episodes of at least {self._span} steps'
       )
     values = np.asarray(ensembles.predict(ensemble, data))

@@ -48,12 +48,12 @@ class Mona(base.Defence):
     setting.controls.check_query('learner.defence.query', self.query)
     if options.steps_per_update % self.horizon:
       raise errors.SpecError(
-          f'learner.defence.horizon: {self.horizon}; allowed are divisors of'
+          f'learner.defence.horizon: {self.horizon}; must be a divisor of'
           f' steps_per_update, which is {options.steps_per_update}'
       )
     if options.gae_lambda != 1.0 and self.horizon > 1:
       raise errors.SpecError(
-          f'learner.gae_lambda: {options.gae_lambda:g} with mona; allowed is'
+          f'learner.gae_lambda: {options.gae_lambda:g} with mona; must be'
           ' 1.0, because others take values of later states'
       )
 

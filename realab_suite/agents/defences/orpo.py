@@ -42,7 +42,6 @@ class Orpo(base.Defence):
     gradients: Number of gradient steps of the discriminator per batch. With too
       few, the learner has found tampering before the discriminator has.
     minibatch: Number of steps of each side per gradient.
-    of: `state_action`, or `state` for the ratio of observations alone.
   """
 
   SEES_READINGS = True
@@ -53,7 +52,6 @@ class Orpo(base.Defence):
   clip: Annotated[float, pydantic.Field(gt=0, le=1e6)] = 1000.0
   gradients: Annotated[int, pydantic.Field(ge=1, le=10_000)] = 128
   minibatch: Annotated[int, pydantic.Field(ge=1, le=10**6)] = 256
-  of: Literal['state_action', 'state'] = 'state_action'
 
   @property
   def trusts(self) -> trusted_policies.TrustedPolicy:
@@ -62,8 +60,7 @@ class Orpo(base.Defence):
   def initial_state(
       self, setting: base.Setting, generator: np.random.Generator
   ) -> dict[str, Any]:
-    options = setting.options
-    size = setting.controls.size if self.of == 'state_action' else 0
+    options, size = setting.options, setting.controls.size
     network = networks.Network(
         setting.encoder, options.hidden, 1, 0.01, generator, size
     )
@@ -97,15 +94,13 @@ class Orpo(base.Defence):
           for side in (is_own, is_trusted)
       ]
       data = base.data_of(batch, setting)
-      if self.of == 'state':
-        data = dict(setting.encoder.encode(batch['observation']))
       trained, log_ratio = _discriminate(
           setting.options, trained, data, np.stack(indices, axis=1)
       )
       ratio = np.exp(np.clip(np.asarray(log_ratio), -20.0, 20.0)) - 1.0
-      own = np.sort(ratio[is_own])
-      kept = own[: max(1, int(np.ceil((1.0 - _TRIMMED) * own.size)))]
-      divergence = float(np.sqrt(max(kept.mean(), 1e-4)))
+      ratios = np.sort(ratio[is_own])
+      size = max(1, int(np.ceil((1.0 - _TRIMMED) * ratios.size)))
+      divergence = float(np.sqrt(max(ratios[:size].mean(), 1e-4)))
       charge = np.clip(ratio / divergence, -self.clip, self.clip)
       metrics = {
           'divergence': divergence,
@@ -126,11 +121,7 @@ def _discriminate(
 ) -> tuple[Any, jax.Array]:
   """Trains the discriminator, and returns the log-ratio of each step.
 
-  Args:
-    options: Options of the optimiser.
-    trained: The discriminator and the state of its optimiser.
-    data: Features, each `(time, worlds, ...)`.
-    indices: Numbers of steps, `(gradients, 2, minibatch)`: own and trusted.
+  `indices` are numbers of steps, `(gradients, 2, minibatch)`: own and trusted.
   """
   samples = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), data)
 
