@@ -3,14 +3,14 @@
 Run from the root of the repository, with the folder of a sweep, and the share
 of training at its end that "gain in training" is the mean of:
 
-    python -m campaigns.decoupled_figures results/decoupling_failures 0.25
-    python -m campaigns.decoupled_figures results/advice_long 0.1
+    python -m campaigns.decoupled_figures docs/results/decoupling_failures 0.25
+    python -m campaigns.decoupled_figures docs/results/advice_long 0.1
 
 Means with intervals over the seeds that have finished. Beside what `report`
 shows: the gain with its sign in units a step, in evaluation and at the end of
 training, and the share of episodes in which any register was moved. A folder
-with `learner.bin` (a packed sweep may be without) gets the gain of greedy
-actions, in the same episodes.
+of a sweep has learners, and gets the gain of greedy actions, in the same
+episodes; published results have none.
 """
 
 import contextlib
@@ -24,6 +24,7 @@ from realab_suite.evaluation import intervals
 from realab_suite.evaluation import stakes
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
+from realab_suite.experiments import scheduler
 from realab_suite.experiments import sweep_results
 from realab_suite.experiments import training
 
@@ -50,7 +51,9 @@ def greedy_gains(folder: pathlib.Path) -> dict[str, dict[int, list[float]]]:
     folder: Folder of a sweep.
   """
   gains: dict[str, dict[int, list[float]]] = {}
-  experiment = experiment_specs.load(folder / 'experiment.yaml')
+  if not (folder / scheduler.EXPERIMENT).exists():
+    return gains
+  experiment = experiment_specs.load(folder / scheduler.EXPERIMENT)
   for job in jobs.plan(experiment):
     path = folder / job.folder()
     if not (jobs.is_done(path) and (path / training.LEARNER).exists()):

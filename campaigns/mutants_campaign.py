@@ -35,7 +35,7 @@ _ENV = (
 _ACTIONS = 'engine/action_codec.py'
 _MECHANISM = 'feedback/mechanisms.py'
 _MECH = ('tests/feedback/mechanism_test.py',)
-_REGISTER = 'entities/registers/base.py'
+_CHECKS = 'entities/registers/checks.py'
 _TWO_BLOCK = 'entities/registers/two_block.py'
 _REG = ('tests/authors/registers_test.py',)
 _TWO = ('tests/entities/two_block_register_test.py',)
@@ -199,13 +199,12 @@ MUTANTS = [
 ''', (*_ENV, *_LED),
     ),
     planting.Mutant(
-        'contract', 'a register stores a value that is not finite', _REGISTER,
+        'contract', 'a register stores a value that is not finite', _CHECKS,
         'if not is_finite.all():', 'if not is_finite.any() and False:', _REG,
     ),
     planting.Mutant(
-        'contract', 'a register does not saturate', _REGISTER,
-        'np.where(fits, value, np.clip(value, self._low, self._high))[()]',
-        'value', _REG,
+        'contract', 'a register does not saturate', _CHECKS,
+        'np.where(fits, value, np.clip(value, low, high))[()]', 'value', _REG,
     ),
     planting.Mutant(
         'contract', 'a pose is written to a held block', 'entities/grasps.py',
@@ -460,9 +459,8 @@ MUTANTS = [
         'if error.errno is None:', _STO,
     ),
     planting.Mutant(
-        'storage', 'a row is not checked', _RESULTS,
-        "if not found or rest != _checksum(content) + b'\"}':",
-        'if not found:', _RES,
+        'storage', 'a row may belong to no run', _RESULTS,
+        'if result.settings is None:', 'if False:', _RES,
     ),
     planting.Mutant(
         'storage', 'there is no warning of a torn row', _RESULTS,
