@@ -119,25 +119,17 @@ def test_mona_takes_no_value_at_a_time_limit_within_a_piece():
   assert treated['discount'][is_valid].tolist() == [1, 0, 0]
 
 
-@pytest.mark.parametrize(
-    ('response', 'paid'), [('screen', 4), ('penalty', 1), ('fine', -3)]
-)
-def test_an_alarm_leaves_steps_out_or_charges_them(response, paid):
+def test_an_alarm_fines_steps():
   # The second step of world 0 has a reading above the threshold, that of
   # world 1 equals it, and the third is the ignored action of a new episode.
   alarm = np.array([[0, 0], [0.6, 0.5], [9, 0]], np.float32)
   is_valid = np.array([[1, 1], [1, 1], [0, 1]], bool)
   batch = _batch([[4, 4]] * 3, readings={'bell': alarm}, is_valid=is_valid)
-  charge = {} if response == 'screen' else {'penalty': 3.0}
-  defence = _make('alarm', register='bell', response=response, **charge)
+  defence = _make('alarm', register='bell', fine=3.0)
   assert defence.reads == ('bell',)
   treated = defence.treat(batch, _setting(2), (), _KEY).batch
-  if response == 'screen':
-    assert treated['is_valid'].tolist() == [[1, 1], [0, 1], [0, 1]]
-    assert treated['reading'].tolist() == [[4, 4]] * 3
-  else:
-    assert treated['is_valid'].tolist() == is_valid.tolist()
-    assert treated['reading'].tolist() == [[4, 4], [paid, 4], [4, 4]]
+  assert treated['is_valid'].tolist() == is_valid.tolist()
+  assert treated['reading'].tolist() == [[4, 4], [-3, 4], [4, 4]]
 
 
 def test_orpo_charges_the_ratio_of_occupancies():
@@ -414,18 +406,9 @@ _BAD = {
         {'kind': 'cap'},
         'learner: defence: caps nothing; low, high or total is required',
     ),
-    'a penalty of 0': (
-        {
-            'kind': 'alarm',
-            'register': 'reward',
-            'response': 'fine',
-            'penalty': 0.0,
-        },
-        'penalty: 0 with response fine; must be more than 0',
-    ),
-    'a penalty of steps that are left out': (
-        {'kind': 'alarm', 'register': 'reward', 'penalty': 5.0},
-        'penalty: 5 with response screen; must be left out',
+    'a fine of 0': (
+        {'kind': 'alarm', 'register': 'reward', 'fine': 0.0},
+        'learner: defence.fine: must be greater than 0, got 0',
     ),
     'another spelling of an option': (
         {'kind': 'alarm', 'register_name': 'reward'},

@@ -1,6 +1,6 @@
 """Tests of learners with a recurrent memory."""
 
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -15,10 +15,12 @@ import jax
 from realab_suite import agents
 from realab_suite import errors
 from realab_suite import trees
+from realab_suite.agents import defences
 from realab_suite.agents import features
 from realab_suite.agents import networks
 from realab_suite.agents import policy_gradient
 from realab_suite.experiments import training
+from tests import registries
 from tests.agents import toys
 
 _QUICK = {
@@ -167,6 +169,16 @@ def test_a_batch_begins_where_the_policy_that_acted_was():
     np.testing.assert_allclose(log_prob, batch['choice']['log_prob'], atol=1e-5)
 
 
+class _Screen(defences.Defence):
+  """Leaves out each step with a right answer."""
+
+  kind: Literal['test_screen']
+
+  def treat(self, batch, setting, state, key):
+    is_valid = batch['is_valid'] & (batch['reading'] <= 0.5)
+    return defences.Treated({**batch, 'is_valid': is_valid}, state)
+
+
 def test_an_episode_goes_on_for_the_memory_where_a_defence_screens(monkeypatch):
   update, batches = policy_gradient._update, []
 
@@ -176,10 +188,11 @@ def test_an_episode_goes_on_for_the_memory_where_a_defence_screens(monkeypatch):
 
   monkeypatch.setattr(policy_gradient, '_update', watched)
   env = toys.Recall(20, phases=5)
-  # Leaves out each step with a right answer, the last one of its episode.
-  alarm = {'kind': 'alarm', 'register': 'reward', 'above': 0.5}
-  learner = _make(env, memory=4, defence=alarm)
-  _train(learner, env, 41)
+  with registries.preserved():
+    defences.DEFENCES.add('test_screen')(_Screen)
+    # The step with a right answer is the last one of its episode.
+    learner = _make(env, memory=4, defence={'kind': 'test_screen'})
+    _train(learner, env, 41)
   assert len(batches) == 4
   for batch in batches:
     screened = batch['reading'] > 0

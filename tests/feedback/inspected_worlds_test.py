@@ -57,13 +57,7 @@ def test_it_loads_in_every_world_with_stations():
 
 
 _RESPONSES = {
-    'screening': (),
-    'penalty, by the learner': (
-        'learner.defence.response=penalty', 'learner.defence.penalty=5',
-    ),
-    'fine, by the learner': (
-        'learner.defence.response=fine', 'learner.defence.penalty=5',
-    ),
+    'fine, by the learner': ('learner.defence.fine=5',),
     'penalty, by the provider': (
         'learner.defence=null', 'providers.0.penalty=5',
     ),
