@@ -1,4 +1,8 @@
-"""Files and folders of runs, with locks, atomic writes and checksums."""
+"""Files and folders of runs, with locks, atomic writes and checksums.
+
+A process may be killed at any time. Files are not synchronised with the disk,
+so a power failure may damage them.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 import contextlib
@@ -102,14 +106,11 @@ def write_whole(path: pathlib.Path, data: bytes) -> None:
     try:
       with open(partial, 'wb') as file:
         file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
       os.replace(partial, path)
     except OSError:
       with contextlib.suppress(OSError):
         partial.unlink()
       raise
-    _sync_folder(path.parent)
 
 
 def write_json(path: pathlib.Path, content: Any) -> None:
@@ -324,36 +325,31 @@ class RunFolder:
     return sorted((self.path / _CHECKPOINTS).glob(f'*{_SUFFIX}'))
 
 
-# Size and SHA-256 of the valid part of a file of lines.
-Mark = Mapping[str, Any]
-NOTHING: Mark = {'size': 0, 'sha256': hashlib.sha256().hexdigest()}
-
-
 @final
 class JsonLines:
   """A file of JSON lines, which can be cut back to a checkpoint."""
 
-  def __init__(self, path: pathlib.Path, mark: Mark | None = None) -> None:
+  def __init__(self, path: pathlib.Path, size: int | None = None) -> None:
     """Opens or creates the file.
 
     Args:
       path: Path of the file.
-      mark: Mark of the end of the valid part. Later lines were written after
-        the checkpoint and are removed. `None` keeps all complete lines.
+      size: Size in bytes at the checkpoint. Later lines are removed. `None`
+        keeps all complete lines.
 
     Raises:
-      ResultsError: If it cannot be opened, or the valid part is incomplete or
-        changed.
+      ResultsError: If it cannot be opened, or is shorter than at the
+        checkpoint.
     """
     self._path = path
     with explained(path):
       data = path.read_bytes() if path.exists() else b''
-      size = data.rfind(b'\n') + 1 if mark is None else mark['size']
-      self._hash = hashlib.sha256(data[:size])
-      if mark is not None and self._hash.hexdigest() != mark['sha256']:
+      if size is None:
+        size = data.rfind(b'\n') + 1
+      if len(data) < size:
         raise errors.ResultsError(
-            f'{path}: changed since the checkpoint was written; remove'
-            f' {path.parent} to run it again'
+            f'{path}: has {len(data)} bytes; must have the {size} of the'
+            f' checkpoint; remove {path.parent} to run it again'
         )
       self._file = open(path, 'ab', buffering=0)
       self._file.truncate(size)
@@ -370,20 +366,14 @@ class JsonLines:
 
   def write(self, lines: bytes) -> None:
     """Adds complete lines; see `append`."""
-    self._hash.update(lines)
     with explained(self._path):
       while lines:
         lines = lines[self._file.write(lines) :]
 
-  def sync(self) -> dict[str, Any]:
-    """Writes all lines to the disk, and returns a mark of the end.
-
-    The mark is valid only if the file was opened with a mark.
-    """
-    with explained(self._path):
-      os.fsync(self._file.fileno())
-      size = os.fstat(self._file.fileno()).st_size
-    return {'size': size, 'sha256': self._hash.hexdigest()}
+  @property
+  def size(self) -> int:
+    """Size in bytes."""
+    return os.fstat(self._file.fileno()).st_size
 
   def close(self) -> None:
     """Closes the file."""
@@ -403,12 +393,3 @@ def difference(there: Any, here: Any, key_path: str = '') -> str:
 def _digest(path: pathlib.Path) -> str:
   with explained(path), open(path, 'rb') as file:
     return hashlib.file_digest(file, 'sha256').hexdigest()
-
-
-def _sync_folder(path: pathlib.Path) -> None:
-  """Makes changes of names in a folder survive a power failure."""
-  descriptor = os.open(path, os.O_RDONLY)
-  try:
-    os.fsync(descriptor)
-  finally:
-    os.close(descriptor)

@@ -352,7 +352,7 @@ class _Training:
     """
     job, path = self._job, self._folder.path
     saved = self._folder.load(header(job.digest(), _CHECKPOINT))
-    marks = (saved or {}).get('marks', {})
+    sizes = (saved or {}).get('sizes', {})
     if saved is not None:
       self._done, self._segment = saved['done'], saved['segment']
       self._pending = saved['pending']
@@ -372,9 +372,9 @@ class _Training:
       else:
         with self._folder.naming_checkpoint():
           time_step = self._restore(learner, saved)
-      for name in (*self._marked, TIMING):
-        mark = marks.get(name, None if name == TIMING else storage.NOTHING)
-        self._files[name] = storage.JsonLines(path / name, mark)
+      for name in (*self._cut, TIMING):
+        size = None if name == TIMING else sizes.get(name, 0)
+        self._files[name] = storage.JsonLines(path / name, size)
         stack.callback(self._files[name].close)
       step, total = (n * self._num_envs for n in (self._done, self._total))
       name = f'{job.run}, seed {job.seed}'
@@ -418,8 +418,8 @@ class _Training:
     return batch_time_steps.BatchTimeStep(**saved['time_step'])
 
   @property
-  def _marked(self) -> list[str]:
-    """Names of the files whose ends checkpoints mark."""
+  def _cut(self) -> list[str]:
+    """Names of the files that are cut back to their sizes at a checkpoint."""
     return [CURVE, TRAINING_EPISODES, *([STAGES] if self._adapts_at else [])]
 
   def _task_of(self, segment: int) -> str:
@@ -528,7 +528,7 @@ class _Training:
             'segment': self._segment,
             'pending': self._pending,
             'machines': self._machines,
-            'marks': {name: self._files[name].sync() for name in self._marked},
+            'sizes': {name: self._files[name].size for name in self._cut},
             'learner': learner.state(),
             'time_step': time_step._asdict(),
             'batch': world,

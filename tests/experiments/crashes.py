@@ -62,11 +62,8 @@ _NAMES = (
     training.TRAINING_EPISODES,
     training.LEARNER,
 )
-# Ways to die at an operation on a file: before it, in the middle of a write, or
-# by a loss of power, which takes back all that was not synchronised, with the
-# new names of files or without.
-KILLED, TORN, POWER, NAMES_FIRST = 'killed', 'torn', 'power', 'names'
-WAYS = (KILLED, TORN, POWER, NAMES_FIRST)
+# Ways to die at an operation on a file: before it, or in the middle of a write.
+WAYS = KILLED, TORN = 'killed', 'torn'
 
 
 # ---- Called in children ------------------------------------------------------
@@ -115,24 +112,17 @@ def run_training(
 
 @final
 class _Shim:
-  """Counts operations of `storage` and `results` on files; kills the process.
-
-  It also keeps what a disk would contain after a loss of power: each file as of
-  its last `fsync`, and each name as of the last `fsync` of its folder.
-  """
+  """Counts operations on files, and kills the process."""
 
   def __init__(self, die_at: int, way: str) -> None:
     self.num_done = 0
     self._die_at = die_at
     self._way = way
-    self._safe_sizes: dict[str, int] = {}
-    self._renames: list[tuple[str, str, bytes | None]] = []
     self._write = io.FileIO.write
-    self._originals = (os.fsync, os.replace, pathlib.Path.unlink)
 
   def install(self) -> None:
     """Replaces the operations on files of this process."""
-    shim, (fsync, replace, unlink) = self, self._originals
+    shim, replace, unlink = self, os.replace, pathlib.Path.unlink
 
     class File(io.FileIO):
       """A file whose writes are counted."""
@@ -149,19 +139,12 @@ class _Shim:
       if mode == 'rb':
         return open(path, mode)
       raw = File(os.fspath(path), mode.replace('b', ''))
-      shim.opened(raw)
       if options.get('buffering') == 0:
         return raw
       return io.BufferedWriter(raw)
 
-    def counted_fsync(descriptor: int) -> None:
-      shim.reach()
-      fsync(descriptor)
-      shim.synchronised(os.readlink(f'/proc/self/fd/{descriptor}'))
-
     def counted_replace(source: Any, target: Any) -> None:
       shim.reach()
-      shim.renamed(str(source), str(target))
       replace(source, target)
 
     def counted_unlink(path: Any, **options: Any) -> None:
@@ -169,31 +152,8 @@ class _Shim:
       unlink(path, **options)
 
     storage.open = results.open = open_counted
-    os.fsync, os.replace = counted_fsync, counted_replace
+    os.replace = counted_replace
     pathlib.Path.unlink = counted_unlink
-
-  def opened(self, file: Any) -> None:
-    """Records that the present content of a file is on the disk."""
-    path = os.path.realpath(file.name)
-    size = os.fstat(file.fileno()).st_size
-    self._safe_sizes[path] = min(size, self._safe_sizes.get(path, size))
-
-  def synchronised(self, path: str) -> None:
-    """Records that a file, or the names in a folder, are on the disk."""
-    if os.path.isdir(path):
-      self._renames = [
-          one for one in self._renames if os.path.dirname(one[1]) != path
-      ]
-    else:
-      self._safe_sizes[path] = os.path.getsize(path)
-
-  def renamed(self, source: str, target: str) -> None:
-    """Records the file that had a name before another one gets it."""
-    old = None
-    if os.path.exists(target):
-      old = pathlib.Path(target).read_bytes()
-    self._renames.append((source, target, old))
-    self._safe_sizes[target] = self._safe_sizes.pop(source, 0)
 
   def reach(self, file: Any = None, data: bytes = b'') -> None:
     """Counts an operation, and ends the process at the last one."""
@@ -202,21 +162,7 @@ class _Shim:
       return
     if self._way == TORN and file is not None:
       self._write(file, data[: len(data) // 2])
-    if self._way in (POWER, NAMES_FIRST):
-      self._lose_power()
     os.kill(os.getpid(), signal.SIGKILL)
-
-  def _lose_power(self) -> None:
-    _, replace, _ = self._originals
-    for path, size in self._safe_sizes.items():
-      if os.path.isfile(path) and os.path.getsize(path) > size:
-        os.truncate(path, size)
-    if self._way == NAMES_FIRST:
-      return
-    for source, target, old in reversed(self._renames):
-      replace(target, source)
-      if old is not None:
-        pathlib.Path(target).write_bytes(old)
 
 
 # ---- Called in tests ---------------------------------------------------------

@@ -453,16 +453,15 @@ def test_a_full_disk_is_reported_and_nothing_is_lost(
 ):
   job = _job()
   path = tmp_path / job.folder()
-  fsync, calls = os.fsync, iter(range(100))
+  replace, calls = os.replace, iter(range(100))
 
-  def failing(descriptor):
-    name = os.readlink(f'/proc/self/fd/{descriptor}')
-    if '.ckpt.partial' in name and next(calls) == 1:
+  def failing(source, target):
+    if target.suffix == '.ckpt' and next(calls) == 1:
       raise OSError(errno.ENOSPC, 'No space left on device')
-    fsync(descriptor)
+    replace(source, target)
 
   with monkeypatch.context() as patch:
-    patch.setattr(storage.os, 'fsync', failing)
+    patch.setattr(storage.os, 'replace', failing)
     with pytest.raises(
         errors.ResultsError, match=r'No space left .*; complete results are'
     ):
