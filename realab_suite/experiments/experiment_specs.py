@@ -172,11 +172,6 @@ class TrainingSpec(validation.Spec):
       raise ValueError(f'tasks: {", ".join(twice)} appears twice')
     return self
 
-  @property
-  def total(self) -> int:
-    """Number of control steps of training and of adaptation."""
-    return self.steps + (self.adaptation or 0)
-
 
 @final
 class EvaluationSpec(validation.Spec):

@@ -10,48 +10,11 @@ import tqdm
 from realab_suite import errors
 from realab_suite.experiments import requirements
 
-# Time between two lines on many jobs.
-_SECONDS_A_LINE = 30.0
-
 
 def check_tensorboard() -> None:
   """Raises a `SpecError` if tensorboardX is not installed."""
   if problem := requirements.missing('tensorboardX', extra='tb'):
     raise errors.SpecError(f'--tensorboard: {problem}')
-
-
-@final
-class Pace:
-  """Makes a line on the progress of many jobs, from time to time."""
-
-  def __init__(self, total: int, steps: int, now: float) -> None:
-    """Starts the clock.
-
-    Args:
-      total: Number of control steps of all jobs.
-      steps: Number of control steps of earlier runs of the jobs.
-      now: Time, in seconds.
-    """
-    self._total = total
-    self._steps, self._time = steps, now
-
-  def line(self, steps: int, now: float) -> str:
-    """Returns a line if the last one was half a minute ago, or else ''.
-
-    Args:
-      steps: Number of control steps so far, which finished jobs include.
-      now: Time, in seconds.
-    """
-    seconds = now - self._time
-    if seconds < _SECONDS_A_LINE:
-      return ''
-    rate = max(steps - self._steps, 0) / seconds
-    self._steps, self._time = steps, now
-    text = f'{steps:,} of {self._total:,} steps'
-    if steps >= self._total:
-      return f'{text}; evaluating'
-    left = f'{(self._total - steps) / rate:.0f} s left' if rate else 'waiting'
-    return f'{text}, {rate:,.0f} steps/s, {left}'
 
 
 @final

@@ -18,9 +18,7 @@ from realab_suite.config import loading
 from realab_suite.experiments import engines
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
-from realab_suite.experiments import progress
 from realab_suite.experiments import storage
-from realab_suite.experiments import training
 
 EXPERIMENT = 'experiment.yaml'
 SWEEP = 'sweep.json'
@@ -28,8 +26,9 @@ LOGS = 'logs'
 AUDITS = 'audits'
 _MODULE = 'realab_suite.launchers.train'
 _POLL_SECONDS = 0.2
-# Number of times that a job is started again after its process was killed.
-_MOST_RESTARTS = 3
+# Time between two lines on the progress.
+_LINE_SECONDS = 30.0
+_ADVICE = 'the same command continues it from its last checkpoint'
 # Fields that may change between sweeps in one folder.
 _FREE_FIELDS = ('description', 'seeds', 'calibration_seeds')
 
@@ -57,8 +56,7 @@ def sweep(
 
   Raises:
     RealabError: If the experiment or the folder is invalid, or if a job fails.
-      A failure does not stop the other jobs. A job whose process was killed,
-      or whose worker was lost, is started again up to three times.
+      A failure does not stop the other jobs.
   """
   seeds = experiment.calibration_seeds if calibration else experiment.seeds
   if not seeds:
@@ -180,13 +178,12 @@ def _advice(folder: pathlib.Path) -> str:
 @final
 @dataclasses.dataclass
 class _Run:
-  """A job of a sweep, which may be started several times."""
+  """A job of a sweep."""
 
   job: jobs.Job
   folder: pathlib.Path
   log: pathlib.Path
   task: Any = None
-  num_restarts: int = 0
 
   def __str__(self) -> str:
     return f'{self.job.run}, seed {self.job.seed}'
@@ -201,18 +198,6 @@ class _Run:
       except errors.InUseError as error:
         return str(error)
     return ''
-
-  @property
-  def num_steps(self) -> int:
-    """Number of control steps of training so far."""
-    if self.job.policy is not None:
-      return 0
-    if (self.folder / storage.DONE).exists():
-      return self.job.training.total
-    try:
-      return int(json.loads(_last_line(self.folder / training.TIMING))['step'])
-    except (ValueError, KeyError, TypeError):  # None yet, or an incomplete one.
-      return 0
 
 
 @final
@@ -243,28 +228,20 @@ class _Sweep:
     self._running: list[_Run] = []
     self._failures: list[str] = []
     self._said: set[str] = set()
+    self._said_at = time.monotonic()
     self._num_finished = 0
 
   def run(self) -> None:
     """Runs all jobs; see `sweep`."""
     count = len(self._all)
-    total = sum(r.job.training.total for r in self._all if not r.job.policy)
-    done = sum(run.num_steps for run in self._all)
-    pace = progress.Pace(total, done, time.monotonic())
-    bar = tqdm.tqdm(total=total, unit='step', unit_scale=True, disable=None)
-    with bar:
+    with tqdm.tqdm(total=count, unit='job', disable=None) as bar:
       try:
         while self._waiting or self._running:
           self._start_waiting()
           self._poll()
-          steps = sum(run.num_steps for run in self._all)
-          bar.update(min(steps, total) - bar.n)
-          if line := pace.line(min(steps, total), time.monotonic()):
-            self._say(line)
-          failed = f', {len(self._failures)} failed' if self._failures else ''
-          bar.set_postfix_str(
-              f'{self._num_finished} of {count} jobs{failed}', refresh=False
-          )
+          bar.update(self._num_finished - bar.n)
+          bar.refresh()
+          self._say_progress(time.monotonic())
           if self._waiting or self._running:
             time.sleep(_POLL_SECONDS)
       finally:
@@ -276,6 +253,17 @@ class _Sweep:
           f' {self._output}'
       )
     self._say(f'{count} jobs finished; results are in {self._output}')
+
+  def _say_progress(self, now: float) -> None:
+    """Says the last line of a running job, every half minute."""
+    if now < self._said_at + _LINE_SECONDS:
+      return
+    for run in self._running:
+      line = _last_line(run.log)
+      if line.startswith(str(run)):
+        self._said_at = now
+        self._say(line)
+        return
 
   def _start_waiting(self) -> None:
     for run in list(self._waiting):
@@ -318,21 +306,13 @@ class _Sweep:
         status = self._engine.poll(run.task)
       except errors.ResultsError as error:
         # A machine of a cluster may be lost; the other jobs continue.
-        status, problem = -1, str(error)
+        status, problem = 1, f'{error}; {_ADVICE}'
       if status is None:
         continue
       self._running.remove(run)
       if status < 0:
-        problem = problem or f'killed by signal {-status}'
-        if run.num_restarts < _MOST_RESTARTS:
-          run.num_restarts += 1
-          self._waiting.append(run)
-          self._say(
-              f'{run}: {problem}; is started again'
-              f' ({run.num_restarts} of {_MOST_RESTARTS})'
-          )
-          continue
-      elif status or not (run.folder / storage.DONE).exists():
+        problem = f'killed by signal {-status}; {_ADVICE}'
+      elif not problem and (status or not (run.folder / storage.DONE).exists()):
         problem = _last_line(run.log) or f'exit status {status}'
       self._finish(run, problem)
 

@@ -73,6 +73,14 @@ class Options:
   tensorboard: bool = False
   parent: int | None = None
 
+  def check_parent(self) -> None:
+    """Raises a `ResultsError` if the parent has ended."""
+    if self.parent is not None and os.getppid() != self.parent:
+      raise errors.ResultsError(
+          f'process {self.parent}, which started this run, has ended; the same'
+          ' command continues the run from its last checkpoint'
+      )
+
 
 def run(job: jobs.Job, output: pathlib.Path, options: Options) -> pathlib.Path:
   """Runs a job, or continues it; a finished job is left unchanged.
@@ -91,6 +99,7 @@ def run(job: jobs.Job, output: pathlib.Path, options: Options) -> pathlib.Path:
   """
   if options.tensorboard:
     progress.check_tensorboard()
+  options.check_parent()
   path = output / job.folder()
   with storage.locked(path):
     folder = storage.RunFolder(path, job.config())
@@ -447,7 +456,7 @@ class _Training:
       display: progress.Display,
   ) -> None:
     while self._done < self._total:
-      self._check_parent()
+      self._options.check_parent()
       if self._done == self._adapts_at:
         self._evaluate_stages(learner)
       if self._recorded is None:
@@ -537,14 +546,6 @@ class _Training:
     if is_replaced and self._done < self._total:
       self._begin_segment()
     return time_step
-
-  def _check_parent(self) -> None:
-    parent = self._options.parent
-    if parent is not None and os.getppid() != parent:
-      raise errors.ResultsError(
-          f'process {parent}, which started this run, has ended; the same'
-          ' command continues the run from its last checkpoint'
-      )
 
 
 @final

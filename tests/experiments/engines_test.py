@@ -1,6 +1,6 @@
 """Tests of the engines of sweeps, with stand-ins for the clusters.
 
-`campaigns.cluster_campaign` runs sweeps on the real ones.
+`campaigns.kills_campaign` runs sweeps on the real ones.
 """
 
 import os

@@ -140,42 +140,51 @@ def test_a_job_lost_by_a_cluster_does_not_stop_the_others(tmp_path):
       errors.ResultsError, match='1 of 2 jobs failed: bad, seed 3: --engine=ray'
   ):
     _sweep(_SMALL, tmp_path, engine)
-  assert engine.commands == [('bad', 3), ('good', 3), *[('bad', 3)] * 3]
-
-
-def _killed_once():
-  """Returns statuses of a job: killed, then finished."""
-  statuses = iter([-9])
-  return lambda: next(statuses, 0)
+  assert engine.commands == [('bad', 3), ('good', 3)]
 
 
 @pytest.mark.usefixtures('no_wait')
-def test_a_killed_job_is_started_again(tmp_path):
-  engine = Pretender(statuses={'bad': _killed_once()})
+def test_a_killed_job_fails_and_the_same_command_continues_it(tmp_path):
+  with pytest.raises(
+      errors.ResultsError,
+      match=r'1 of 2 jobs failed: bad, seed 3: killed by signal 9; the same com'
+      r'mand continues it from its last checkpoint; results of the others are',
+  ):
+    _sweep(_SMALL, tmp_path, Pretender(statuses={'bad': -9}))
+  engine = Pretender()
   said = _sweep(_SMALL, tmp_path, engine)
-  assert engine.commands == [('bad', 3), ('good', 3), ('bad', 3)]
-  assert said[0] == 'bad, seed 3: killed by signal 9; is started again (1 of 3)'
+  assert engine.commands == [('bad', 3)]
   assert said[-1] == f'2 jobs finished; results are in {tmp_path}'
 
 
-@pytest.mark.parametrize('is_lost', [True, False], ids=['lost', 'left'])
-def test_a_job_whose_process_survived_is_done_once(
-    tmp_path, monkeypatch, is_lost
+@pytest.mark.usefixtures('no_wait')
+def test_the_last_line_of_a_running_job_is_said_from_time_to_time(
+    tmp_path, monkeypatch
 ):
-  # The process survives its worker, or an earlier sweep.
+  monkeypatch.setattr(scheduler, '_LINE_SECONDS', 0.0)
+  is_over = iter([False, True])
+
+  class Slow(Pretender):
+
+    def start(self, command, log):
+      task = super().start(command, log)
+      log.write_text(f'{_flag(command, "run")}, seed 3: step 20 of 60\n')
+      return task
+
+    def poll(self, task):
+      return super().poll(task) if next(is_over) else None
+
+  said = _sweep(_SMALL, tmp_path, Slow(), only=['good'])
+  assert said[0] == 'good, seed 3: step 20 of 60'
+
+
+def test_a_job_whose_process_survived_its_sweep_is_done_once(
+    tmp_path, monkeypatch
+):
   [job] = jobs.plan(experiment_specs.load(_SMALL), only=['bad'])
   survivors = contextlib.ExitStack()
-
-  def begin():
-    survivors.enter_context(storage.locked(tmp_path / job.folder()))
-
-  def lose():
-    begin()
-    raise errors.ResultsError('--engine=ray: a machine is gone')
-
-  if not is_lost:
-    begin()
-  engine = Pretender(statuses={'bad': lose})
+  survivors.enter_context(storage.locked(tmp_path / job.folder()))
+  engine = Pretender()
   num_pauses = 0
 
   def sleep(seconds):
@@ -188,7 +197,7 @@ def test_a_job_whose_process_survived_is_done_once(
   monkeypatch.setattr(scheduler.time, 'sleep', sleep)
   said = _sweep(_SMALL, tmp_path, engine)
   assert num_pauses >= 5
-  assert engine.commands == [*[('bad', 3)] * is_lost, ('good', 3)]
+  assert engine.commands == [('good', 3)]
   assert ' '.join(said).count('bad, seed 3: folder ') == 1
   assert said[-1] == f'2 jobs finished; results are in {tmp_path}'
 
