@@ -397,9 +397,9 @@ MUTANTS = [
         ('tests/experiments/finished_jobs_test.py',),
     ),
     planting.Mutant(
-        'storage', '`done.json` may be damaged', _STORAGE,
-        '  if checksum != validation.digest_of(content):',
-        '  if not isinstance(content, dict):', _STO,
+        'storage', '`done.json` may list no files', _STORAGE,
+        'if not isinstance(files, dict) or not all(', 'if files and not all(',
+        ('tests/experiments/storage_test.py',),
     ),
     planting.Mutant(
         'storage', 'only the last checkpoint is kept', _STORAGE,

@@ -97,7 +97,7 @@ def publish(folder: pathlib.Path, output: pathlib.Path) -> tuple[int, int]:
     folders = {job.seed: job.folder for job in run.jobs}
     for seed, config in run.configs.items():
       path = folder / folders[seed] / storage.DONE
-      facts = storage.read_sealed(path, '')
+      facts = storage.read_json(path)
       done[folders[seed]] = {
           'config': _index(configs, {**config, 'seed': None}),
           'machines': _index(machines, facts.get('machines', [])),

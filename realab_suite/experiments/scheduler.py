@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping, Sequence
 import dataclasses
-import hashlib
 import json
 import os
 import pathlib
@@ -92,7 +91,6 @@ def _describe(
   text = yaml.safe_dump(experiment.to_mapping(), sort_keys=False)
   description = {
       'schema': 1,
-      'sha256': hashlib.sha256(text.encode()).hexdigest(),
       'experiment': experiment.name,
       'calibration': calibration,
       'jobs': [
@@ -110,7 +108,7 @@ def _describe(
           for job in planned
       ],
   }
-  storage.write_sealed(output / SWEEP, description)
+  storage.write_json(output / SWEEP, description)
   storage.write_whole(output / EXPERIMENT, text.encode())
 
 
@@ -128,9 +126,11 @@ def check_experiment(
     ResultsError: If the folder belongs to another experiment.
   """
   requested = {**experiment, 'calibration': calibration}
+  description = storage.read_json(folder / SWEEP)
+  is_mapping = isinstance(description, dict)
   existing = {
       **loading.read_mapping(folder / EXPERIMENT),
-      'calibration': read_description(folder)['calibration'],
+      'calibration': is_mapping and description.get('calibration'),
   }
   fixed = [
       {key: value for key, value in one.items() if key not in _FREE_FIELDS}
@@ -142,37 +142,6 @@ def check_experiment(
         f'folder {folder} belongs to another experiment: {differing}; name'
         ' another folder'
     )
-
-
-def read_description(folder: pathlib.Path) -> dict[str, Any]:
-  """Returns the contents of `sweep.json`.
-
-  Raises:
-    ResultsError: If the file is damaged.
-  """
-  return storage.read_sealed(folder / SWEEP, _advice(folder))
-
-
-def read_experiment(
-    folder: pathlib.Path, description: Mapping[str, Any]
-) -> dict[str, Any]:
-  """Returns the contents of the experiment file of a sweep.
-
-  Raises:
-    ResultsError: If the file does not match the description.
-  """
-  path = folder / EXPERIMENT
-  with storage.explained(path):
-    text = path.read_bytes()
-  if hashlib.sha256(text).hexdigest() != description.get('sha256'):
-    raise errors.ResultsError(
-        f'{path}: changed since the sweep began; {_advice(folder)}'
-    )
-  return loading.parse_yaml(text, os.fspath(path))
-
-
-def _advice(folder: pathlib.Path) -> str:
-  return f'remove {folder / EXPERIMENT}, then run the same sweep again'
 
 
 @final

@@ -17,7 +17,6 @@ from typing import Any, final
 
 from realab_suite import archive
 from realab_suite import errors
-from realab_suite.config import validation
 
 CONFIG = 'config.json'
 DONE = 'done.json'
@@ -115,11 +114,7 @@ def write_whole(path: pathlib.Path, data: bytes) -> None:
 
 def write_json(path: pathlib.Path, content: Any) -> None:
   """Writes a JSON file atomically."""
-  write_whole(path, _json(content))
-
-
-def _json(content: Any) -> bytes:
-  return (json.dumps(content, indent=2) + '\n').encode()
+  write_whole(path, (json.dumps(content, indent=2) + '\n').encode())
 
 
 def read_json(path: pathlib.Path) -> Any:
@@ -194,50 +189,21 @@ def is_done(path: pathlib.Path) -> bool:
   return True
 
 
-def sealed(content: Mapping[str, Any]) -> bytes:
-  """Returns a JSON file with a checksum."""
-  return _json({**content, 'checksum': validation.digest_of(content)})
-
-
-def write_sealed(path: pathlib.Path, content: Mapping[str, Any]) -> None:
-  """Writes a JSON file with a checksum, atomically."""
-  write_whole(path, sealed(content))
-
-
-def read_sealed(path: pathlib.Path, advice: str) -> dict[str, Any]:
-  """Returns the contents of a JSON file with a checksum.
-
-  Args:
-    path: Path of the file.
-    advice: Advice to add to the message if the file is damaged.
-
-  Raises:
-    ResultsError: If it cannot be read or is damaged.
-  """
-  content = read_json(path)
-  checksum = content.pop('checksum', '') if isinstance(content, dict) else ''
-  if checksum != validation.digest_of(content):
-    raise errors.ResultsError(
-        f'{path}: damaged: its checksum does not match; {advice}'
-    )
-  sealed: dict[str, Any] = content
-  return sealed
-
-
 def read_done(path: pathlib.Path) -> dict[str, str]:
   """Returns the SHA-256 of each result, by the name of its file.
 
   Raises:
-    ResultsError: If the file cannot be read or is damaged.
+    ResultsError: If the file cannot be read or does not list files of a run.
   """
-  advice = f'remove {path.parent} to run it again'
-  files: dict[str, str] = read_sealed(path, advice).get('files', {})
-  for name in files:
-    # A checksum is no signature: an edited file may have a correct one.
-    if not re.fullmatch(r'\w[\w.-]*', name):
-      raise errors.ResultsError(
-          f'{path}: {name!r:.80} is not a file of a run; {advice}'
-      )
+  content = read_json(path)
+  files = content.get('files') if isinstance(content, dict) else None
+  if not isinstance(files, dict) or not all(
+      re.fullmatch(r'\w[\w.-]*', name) for name in files
+  ):
+    raise errors.ResultsError(
+        f'{path}: files must be names of files of the run; remove'
+        f' {path.parent} to run it again'
+    )
   return files
 
 
@@ -264,7 +230,7 @@ class RunFolder:
       facts: Further facts to record.
     """
     files = {name: _digest(self.path / name) for name in names}
-    write_sealed(self.path / DONE, {**facts, 'files': files})
+    write_json(self.path / DONE, {**facts, 'files': files})
     for checkpoint in self._checkpoints():
       with explained(checkpoint):
         checkpoint.unlink()

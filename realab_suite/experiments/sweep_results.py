@@ -15,6 +15,7 @@ import pydantic
 
 from realab_suite import errors
 from realab_suite import worlds
+from realab_suite.config import loading
 from realab_suite.config import task_names
 from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
@@ -270,15 +271,14 @@ def load(folder: pathlib.Path) -> Sweep:
     )
   path = folder / scheduler.SWEEP
   try:
-    content = scheduler.read_description(folder)
-    description = _Description.model_validate(content)
+    description = _Description.model_validate(storage.read_json(path))
   except pydantic.ValidationError as error:
     first = error.errors()[0]
     key_path = '.'.join(str(part) for part in first['loc'])
     raise errors.ResultsError(
         f'{path}: {key_path or "contents"}: {first["msg"]}'
     ) from error
-  experiment = scheduler.read_experiment(folder, content)
+  experiment = loading.read_mapping(folder / scheduler.EXPERIMENT)
   planned: dict[str, list[Job]] = {}
   for job in description.jobs:
     planned.setdefault(job.run, []).append(job)

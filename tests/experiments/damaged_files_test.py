@@ -20,8 +20,7 @@ from tests.experiments import file_kinds
 _FORBIDDEN = ('pickle.find_class', 'os.system')
 _NAMES = (
     'checkpoint', 'learner.bin', 'snapshot', 'trace.bin', 'network',
-    'sweep.json', 'experiment.yaml', 'done.json', 'config.json',
-    'episodes.jsonl', 'curve.jsonl',
+    'config.json', 'episodes.jsonl', 'curve.jsonl',
 )  # fmt: skip
 _HEARD: list[str] = []
 _is_listening = False

@@ -109,9 +109,6 @@ def build(folder: pathlib.Path) -> list[Kind]:
       Kind('snapshot', world, lambda: _of_snapshot(world, world_header)),
       Kind('trace.bin', run / training.TRACE, lambda: of_done(training.TRACE)),
       Kind('network', network, load_network),
-      Kind('sweep.json', sweep / scheduler.SWEEP, load_sweep),
-      Kind('experiment.yaml', sweep / scheduler.EXPERIMENT, load_sweep),
-      Kind('done.json', run / storage.DONE, load_done),
       Kind('config.json', run / storage.CONFIG, load_sweep),
       Kind(
           'episodes.jsonl',

@@ -244,7 +244,7 @@ def test_a_folder_without_a_sweep_is_refused(tmp_path):
 
 def test_a_wrong_description_is_refused(own_folder):
   content = {'experiment': 'x', 'jobs': []}
-  storage.write_sealed(own_folder / scheduler.SWEEP, content)
+  storage.write_json(own_folder / scheduler.SWEEP, content)
   with pytest.raises(errors.ResultsError, match=r'sweep\.json: calibration'):
     sweep_results.load(own_folder)
 
