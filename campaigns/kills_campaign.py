@@ -44,7 +44,6 @@ _NUM_KILLS = 20
 _STEPS = 8_000
 # Files with times, of the processes themselves, and for continuing.
 _NOT_COMPARED = {training.TIMING, 'lock', scheduler.LOGS, 'checkpoints'}
-_FINISHED = 'Results are in'
 
 
 def _experiment(scale: float, seed: int) -> dict[str, Any]:
@@ -169,7 +168,7 @@ class _Sweep:
     ]
     return sum(
         self._written(folder) != self._finished.get(folder)
-        or log.count(_FINISHED) > 1
+        or log.count('Results are in') > 1
         or 'has finished already' in log
         for folder, log in zip(self._folders, logs, strict=True)
     )
