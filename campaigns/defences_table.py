@@ -41,13 +41,11 @@ from realab_suite.agents import defences
 from realab_suite.config import validation
 from realab_suite.evaluation import intervals
 from realab_suite.evaluation import verdicts
-from realab_suite.experiments import result_tables
 from realab_suite.experiments import sweep_results
 from realab_suite.experiments import tables
 from realab_suite.feedback import providers
 from realab_suite.reports import charts
 from realab_suite.reports import numbers
-from realab_suite.reports import report_tables
 
 _HEADER = (
     'world', 'run', 'true return', 'hack rate (%)', "control's (%)", 'label',
@@ -250,22 +248,19 @@ def _line(one: Entry) -> list[tables.Figure]:
   return [
       one.world,
       f'`{one.own.run.name}`',
-      result_tables.return_text(one.own.summary),
-      *result_tables.hacking_figures(one.own.hacking)[:2],
-      report_tables.labels_text(one.own),
+      one.own.columns['true return'],
+      one.own.columns['hack rate (%)'],
+      one.own.columns["control's (%)"],
+      one.own.label,
       one.own.summary.corruption,
       _silenced(one),
-      one.twin and result_tables.return_text(one.twin.summary),
+      one.twin and one.twin.columns['true return'],
       _tax(one),
       _false_alarms(one),
       spent / others if spent and others else None,
       _gradients(one),
       _inspections(one),
   ]
-
-
-def _rate(one: Entry) -> tables.Figure:
-  return result_tables.hacking_figures(one.own.hacking)[0]
 
 
 def lines(found: Sequence[Entry]) -> list[list[tables.Figure]]:
@@ -297,7 +292,8 @@ def worlds(found: Sequence[Entry]) -> list[list[tables.Figure]]:
     if len({one.world for _, one in judged}) > 1:
       judged.sort(key=lambda pair: pair[0])
       ends = (judged[0][1], judged[-1][1])
-      cells = (f'{tables.text(_rate(one))} ({one.world})' for one in ends)
+      rates = [tables.text(one.own.columns['hack rate (%)']) for one in ends]
+      cells = (f'{x} ({one.world})' for x, one in zip(rates, ends, strict=True))
       table.append([f'`{of_design[0].own.run.name}`', *cells])
   return table
 

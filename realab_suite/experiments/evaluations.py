@@ -177,8 +177,7 @@ class Evaluation:
     if self._control is not None:
       obstacles = judging.obstacles_of(world, design, stake)
       solver = world.solver if judging.coincides(world, design) else None
-    lines = result_tables.summarize(
-        self.rows,
+    rules = result_tables.Rules(
         self._control,
         gains.consumed(design),
         stake,
@@ -187,6 +186,7 @@ class Evaluation:
         obstacles,
         solver,
     )
+    lines = result_tables.summarize(self.rows, rules)
     text = result_tables.as_text(lines)
     if self._folder is not None:
       whole = f'{title}\n\n{text}\n'

@@ -1,11 +1,12 @@
 """Tables of figures: the one writer of texts, Markdown and CSV."""
 
 from collections.abc import Iterable, Mapping, Sequence
-import csv
 import dataclasses
-import io
 import math
 from typing import Any, final
+
+import pandas as pd
+import tabulate
 
 from realab_suite.evaluation import intervals
 
@@ -13,6 +14,24 @@ NOTHING = '-'
 
 Figure = intervals.Interval | float | int | str | None
 """Contents of a cell; `None` is a figure that is not known."""
+
+
+def frame(
+    records: Iterable[Mapping[str, Any]], columns: Sequence[str] | None = None
+) -> pd.DataFrame:
+  """Returns records as a data frame, a row each.
+
+  Cells are objects: a whole number stays one beside a figure that is `None`.
+
+  Args:
+    records: Figures by the names of their columns.
+    columns: Columns of the frame; `None` for those of all records.
+  """
+  records = list(records)
+  if columns is None:
+    columns = list(dict.fromkeys(name for record in records for name in record))
+  rows = [[record.get(name) for name in columns] for record in records]
+  return pd.DataFrame(rows, columns=list(columns), dtype=object)
 
 
 @final
@@ -23,27 +42,28 @@ class Table:
   Attributes:
     title: Title of the table.
     note: Explanation of the columns.
-    header: Names of the columns.
-    rows: Figures of each row, one per column.
+    frame: Figures, with the columns of the table.
     words: Names of the columns that contain words instead of numbers.
   """
 
   title: str
   note: str
-  header: Sequence[str]
-  rows: Sequence[Sequence[Figure]]
+  frame: pd.DataFrame
   words: Sequence[str] = ('run',)
+
+  @property
+  def header(self) -> list[str]:
+    """Names of the columns."""
+    return list(self.frame.columns)
 
   @property
   def texts(self) -> list[list[str]]:
     """Text of each cell, row by row."""
-    return [[text(figure) for figure in row] for row in self.rows]
+    return [[text(figure) for figure in row] for row in self.frame.to_numpy()]
 
   def markdown(self) -> str:
     """Returns the table with its title and its note."""
-    cells = [
-        [escaped(cell) for cell in row] for row in (self.header, *self.texts)
-    ]
+    cells = [[escaped(x) for x in row] for row in (self.header, *self.texts)]
     return f'## {self.title}\n\n{self.note}\n\n{markdown(cells)}'
 
 
@@ -64,13 +84,11 @@ def text(figure: Figure) -> str:
       return intervals.short(_without_noise(figure))
   if math.isnan(figure.low):
     return text(figure.estimate)
-  rounded = dataclasses.replace(
-      figure,
-      estimate=_without_noise(figure.estimate),
-      low=_without_noise(figure.low),
-      high=_without_noise(figure.high),
+  estimate, low, high = (
+      _without_noise(value)
+      for value in (figure.estimate, figure.low, figure.high)
   )
-  return str(rounded)
+  return str(dataclasses.replace(figure, estimate=estimate, low=low, high=high))
 
 
 def _without_noise(value: float) -> float:
@@ -78,23 +96,17 @@ def _without_noise(value: float) -> float:
   return round(value, 6) + 0.0
 
 
-def markdown(rows: Iterable[Sequence[Figure]]) -> str:
+def markdown(table: pd.DataFrame | Iterable[Sequence[Figure]]) -> str:
   """Returns a Markdown table with aligned columns.
 
   Args:
-    rows: Header and rows. Their markup is not escaped.
+    table: A data frame, or a header and rows. Their markup is not escaped.
   """
-  header, *body = ([text(figure) for figure in row] for row in rows)
-  widths = [max(map(len, column)) for column in zip(header, *body, strict=True)]
-  lines = [
-      ' | '.join(
-          cell.ljust(width) for cell, width in zip(row, widths, strict=True)
-      )
-      for row in (header, *body)
-  ]
-  rule = '|'.join('-' * (width + 2) for width in widths)
-  first, *others = (f'| {line} |' for line in lines)
-  return '\n'.join([first, f'|{rule}|', *others])
+  if isinstance(table, pd.DataFrame):
+    table = [table.columns, *table.to_numpy()]
+  header, *body = ([text(figure) for figure in row] for row in table)
+  # Parsed as a number, 1.20 would become 1.2.
+  return str(tabulate.tabulate(body, header, 'github', disable_numparse=True))
 
 
 def escaped(cell: str) -> str:
@@ -104,21 +116,19 @@ def escaped(cell: str) -> str:
   return cell
 
 
-def csv_text(records: Sequence[Mapping[str, Any]]) -> str:
+def csv_text(records: Iterable[Mapping[str, Any]]) -> str:
   """Returns records as CSV, a line each, with the columns of all of them."""
-  columns = list(dict.fromkeys(key for record in records for key in record))
-  file = io.StringIO(newline='')
-  writer = csv.DictWriter(file, columns, lineterminator='\n')
-  writer.writeheader()
-  writer.writerows(records)
-  return file.getvalue()
+  # As texts, because pandas leaves a cell empty for NaN as for `None`.
+  cells = frame(records).map(lambda cell: None if cell is None else str(cell))
+  return str(cells.to_csv(index=False, lineterminator='\n'))
 
 
-def interval_record(
-    name: str, interval: intervals.Interval | None
+def ends(
+    figures: Mapping[str, intervals.Interval | None],
 ) -> dict[str, float | None]:
-  """Returns the columns of an interval in a CSV file."""
-  ends: tuple[float | None, ...] = (None,) * 3
-  if interval is not None:
-    ends = (interval.estimate, interval.low, interval.high)
-  return dict(zip((name, f'{name}_low', f'{name}_high'), ends, strict=True))
+  """Returns intervals as columns of a CSV file: each estimate and its ends."""
+  return {
+      f'{name}{suffix}': interval and getattr(interval, end)
+      for name, interval in figures.items()
+      for suffix, end in (('', 'estimate'), ('_low', 'low'), ('_high', 'high'))
+  }

@@ -139,7 +139,9 @@ def _render(
       clips=[clip for clip in clips if clip is not film],
       no_clips=no_clips,
       records=[
-          table for table in (_made_with(sweep), _speeds(sweep)) if table.rows
+          table
+          for table in (_made_with(sweep), _speeds(sweep))
+          if not table.frame.empty
       ],
       experiment=yaml.safe_dump(dict(sweep.experiment), sort_keys=False),
       designs={
@@ -243,22 +245,26 @@ def _made_with(sweep: sweep_results.Sweep) -> tables.Table:
     for config in run.configs.values():
       for key, value in config.get('versions', {}).items():
         found.setdefault(key, {})[str(value)] = None
-  rows = [[key, '; '.join(values)] for key, values in found.items()]
-  header = ['item', 'value']
-  return tables.Table('Versions and machine', '', header, rows, header)
+  frame = tables.frame(
+      {'item': key, 'value': '; '.join(values)} for key, values in found.items()
+  )
+  return tables.Table('Versions and machine', '', frame, list(frame))
 
 
 def _speeds(sweep: sweep_results.Sweep) -> tables.Table:
   """Returns the training time of each run."""
-  rows = []
+  records = []
   for run in sweep.runs.values():
-    lines = [one for one in run.timing.values() if one]
-    if lines:
-      seconds = [sum(line['seconds'] for line in one) for one in lines]
-      steps = sum(max(line['step'] for line in one) for one in lines)
-      total = max(sum(seconds), 1e-9)
-      rows.append(
-          [run.name, f'{np.mean(seconds):,.0f}', f'{steps / total:,.0f}']
+    if lines := [points for points in run.timing.values() if points]:
+      seconds = [sum(point['seconds'] for point in points) for points in lines]
+      steps = sum(max(point['step'] for point in points) for points in lines)
+      records.append(
+          {
+              'run': run.name,
+              'seconds per seed': f'{np.mean(seconds):,.0f}',
+              'control steps per second': (
+                  f'{steps / max(sum(seconds), 1e-9):,.0f}'
+              ),
+          }
       )
-  header = ['run', 'seconds per seed', 'control steps per second']
-  return tables.Table('Training time', '', header, rows)
+  return tables.Table('Training time', '', tables.frame(records))

@@ -1,11 +1,17 @@
-"""Figures of each run in a report, as numbers; see `report_tables`."""
+"""Figures of each run in a report: all are computed here, once.
 
+`report_tables`, `headline`, `caveats` and `plots` show them.
+"""
+
+import collections
 from collections.abc import Callable, Iterable, Mapping, Sequence
 import dataclasses
+import functools
 import math
 from typing import Any, NamedTuple, final
 
 import numpy as np
+import pandas as pd
 
 from realab_suite import judging
 from realab_suite.evaluation import attribution_metrics
@@ -17,19 +23,22 @@ from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
 from realab_suite.evaluation import verdicts
 from realab_suite.experiments import jobs
+from realab_suite.experiments import result_tables
 from realab_suite.experiments import sweep_results
+from realab_suite.experiments import tables
 from realab_suite.reports import audits
 
 _Rows = Sequence[results.EpisodeResult]
 _Label = verdicts.Label
 
-REGISTER_PARTS = ('corruption', 'units', 'own', 'inherited')
-"""Corruption of a register from end to end, in metres and in its units; its own
-part and its inherited one, in metres."""
-
-MOVERS = ('agent', 'world', 'agent_share')
-"""Own corruption that the agent has caused and that the world has caused, in
-metres; the agent's share, from 0 to 1, in episodes with own corruption."""
+REGISTER_COLUMNS = {
+    'corruption_metres': 'corruption',
+    'corruption_units': 'units',
+    'own_metres': 'own',
+    'inherited_metres': 'inherited',
+}
+"""Parts of the corruption of a register, by the ends of their columns: from end
+to end in metres and in its units, its own part, and its inherited one."""
 
 # An agent fails at the task if it earns less than this share of what the solver
 # earns.
@@ -70,10 +79,9 @@ class Figures:
     audit: Audit of the design in this world, or `None`.
     fails: True if the agent fails at the task, False if it does not, `None` if
       that is unclear or no solver acted.
-    registers: Corruption of each register that was read, whether the learner
-      consumes it or not, by the names in `REGISTER_PARTS`.
-    movers: Own corruption of what the learner consumes, by the names in
-      `MOVERS`; `None` if no episode was attributed.
+    means: Corruption of each register that was read, whether the learner
+      consumes it or not, and, if episodes were attributed, own corruption of
+      what it consumes by movers; by their columns in `tables.csv`.
     outcomes: Mean of each event that the task counts.
     coverage: Share of writes that were read.
     gap: Tampering gap: true return of the secure twin minus that of the run;
@@ -88,21 +96,41 @@ class Figures:
   verdict: verdicts.Verdict | None
   audit: verdicts.Audit | None
   fails: bool | None
-  registers: Mapping[str, Mapping[str, intervals.Interval]]
-  movers: Mapping[str, intervals.Interval | None] | None
+  means: Mapping[str, intervals.Interval]
   outcomes: Mapping[str, intervals.Interval]
   coverage: float | None
   gap: intervals.Interval | None
   stages: Mapping[str, tuple[str, comparison.RunSummary]]
 
+  @functools.cached_property
+  def columns(self) -> dict[str, tables.Figure]:
+    """Figures of the run in the tables, by their columns."""
+    figures = result_tables.columns(self.summary, self.hacking)
+    return {'run': self.run.name, 'agent': self.run.jobs[0].kind, **figures}
+
+  @property
+  def label(self) -> str:
+    """Labels of the seeds with their numbers, the most frequent one first."""
+    counts = collections.Counter(
+        seed.judgement.label.value for seed in self.seeds.values()
+    )
+    total = len(self.seeds)
+    if len(counts) == 1:
+      [label] = counts
+      return f'{label} (all {total} seeds)' if total > 1 else label
+    return ', '.join(
+        f'{label} ({count} of {total})' for label, count in counts.most_common()
+    )
+
   @property
   def training(self) -> verdicts.Training | None:
     """Training episodes of all seeds in which tampering paid."""
-    known = [one.training for one in self.seeds.values() if one.training]
+    known = [seed.training for seed in self.seeds.values() if seed.training]
     if not known:
       return None
     return verdicts.Training(
-        sum(one.paid for one in known), sum(one.episodes for one in known)
+        sum(training.paid for training in known),
+        sum(training.episodes for training in known),
     )
 
 
@@ -129,36 +157,38 @@ def compute(
 
 def _figures(sweep: sweep_results.Sweep, run: sweep_results.Run) -> Figures:
   counting = [row for row in run.rows if row.counts]
-  found, seeds, verdict, audit = None, {}, None, None
+  hacked, seeds, verdict, audit = None, {}, None, None
   stake, why = _stake(run)
-  control = None if stake is None else _control(sweep, run, stake)
-  if stake is not None and control is not None:
-    found = hacking.hacking(run.rows, control, stake)
+  if stake is not None:
+    control = _control(sweep, run, stake)
+    hacked = control and hacking.hacking(run.rows, control, stake)
   is_judged = not run.is_scripted and run.twin_of is None
   if is_judged:
     audit = audits.of_run(sweep, run)
-  if not run.is_scripted:
-    seeds = _seeds(sweep, run, stake, found, audit, why)
+  if not run.is_scripted and stake is not None and hacked is not None:
+    seeds = _seeds(sweep, run, stake, hacked, audit)
+  elif not run.is_scripted:
+    why = why or 'there is no control'
+    unknown = verdicts.Judgement(_Label.NOT_JUDGED, why)
+    seeds = {seed: Seed(unknown, None, None, None) for seed in run.configs}
   if is_judged:
-    verdict = verdicts.verdict([one.judgement for one in seeds.values()])
+    verdict = verdicts.verdict([seed.judgement for seed in seeds.values()])
   coverage = [
-      one.coverage
+      register.coverage
       for row in counting
-      for one in row.registers.values()
-      if one.coverage is not None
+      for register in row.registers.values()
+      if register.coverage is not None
   ]
-  twin = sweep.twin(run)
-  summary = comparison.summary(run.name, run.rows)
+  twin, summary = sweep.twin(run), comparison.summary(run.name, run.rows)
   return Figures(
       run=run,
       summary=summary,
-      hacking=found,
+      hacking=hacked,
       seeds=seeds,
       verdict=verdict,
       audit=audit,
       fails=_fails(sweep, run, summary.true_return),
-      registers=_registers(counting, run),
-      movers=_movers(counting),
+      means=_means(counting),
       outcomes=_outcomes([row for row in run.rows if row.is_valid]),
       coverage=float(np.mean(coverage)) if coverage else None,
       gap=None if twin is None else gained(twin, run),
@@ -212,68 +242,75 @@ def _control(
 def _seeds(
     sweep: sweep_results.Sweep,
     run: sweep_results.Run,
-    stake: stakes.Stakes | None,
-    found: hacking.Hacking | None,
+    stake: stakes.Stakes,
+    hacked: hacking.Hacking,
     audit: verdicts.Audit | None,
-    why: str,
 ) -> dict[int, Seed]:
   """Returns the figures of the seeds of a learned run or a twin."""
-  if stake is None or found is None:
-    unknown = verdicts.Judgement(
-        _Label.NOT_JUDGED, why or 'there is no control'
-    )
-    return {seed: Seed(unknown, None, None, None) for seed in run.configs}
-  twin = sweep.twin(run)
-  baseline = sweep.runs.get(run.baseline or '')
-  beside, twin_rows = (twin.transplants, twin.rows) if twin else ((), ())
-  if twin is None and baseline is not None:
-    beside = twin_rows = baseline.rows
-  obstacles, coincidence = [], None
-  if run.twin_of is None:
+  shared = _shared_judgement(sweep, run, stake)
+  obstacles = []
+  if shared is None:
     obstacles = judging.obstacles_of(run.world, run.design, stake)
-    if judging.coincides(run.world, run.design):
-      coincidence = verdicts.coincidence(
-          run.rows, solver_rows(sweep, run), stake
-      )
-  others = {
-      name: run.design.ports[name].range
-      for name in gains.unconsumed(run.design)
-  }
   seeds = {}
   for seed, episodes in run.training_episodes().items():
     number = run.evaluation_seed(seed)
-    rows = [row for row in run.rows if row.seed == number]
-    count = found.by_seed.get(number)
-    paid = _count(episodes, stake, found.control).hacked
-    training = verdicts.Training(paid, len(episodes))
-    onset = None
-    if run.twin_of is not None:
-      judgement = verdicts.Judgement(_Label.CONTROL)
-    elif coincidence is not None:
-      judgement = coincidence
+    count = hacked.by_seed.get(number)
+    paid = _count(episodes, stake, hacked.control).hacked
+    training, onset = verdicts.Training(paid, len(episodes)), None
+    if shared is not None:
+      judgement = shared
     elif count is None:
       why = 'all of its episodes failed'
       judgement = verdicts.Judgement(_Label.UNCLEAR, why)
     else:
-      loss = 'it gains more than its control and earns less than its twin'
-      at_a_loss = verdicts.gains_at_a_loss(rows, beside, twin_rows, stake)
-      aside = verdicts.corrupts_aside(rows, beside, others)
+      rows = [row for row in run.rows if row.seed == number]
+      aside, at_a_loss = _own_obstacles(sweep, run, rows, stake)
       judgement = verdicts.label(
           count,
-          found.control,
+          hacked.control,
           training=training,
           audit=audit,
-          obstacles=[
-              *([aside] if aside else []),
-              *obstacles,
-              *([loss] if at_a_loss else []),
-          ],
+          obstacles=[*aside, *obstacles, *at_a_loss],
           is_censored=not all(row.is_valid for row in rows),
       )
     if judgement.label is _Label.TAMPERS:
-      onset = _onset(run.curves[seed], episodes, stake, found.control)
+      onset = _onset(run.curves[seed], episodes, stake, hacked.control)
     seeds[seed] = Seed(judgement, count, training, onset)
   return seeds
+
+
+def _shared_judgement(
+    sweep: sweep_results.Sweep, run: sweep_results.Run, stake: stakes.Stakes
+) -> verdicts.Judgement | None:
+  """Returns the label that all seeds of a run have, or `None`."""
+  if run.twin_of is not None:
+    return verdicts.Judgement(_Label.CONTROL)
+  if judging.coincides(run.world, run.design):
+    return verdicts.coincidence(run.rows, solver_rows(sweep, run), stake)
+  return None
+
+
+def _own_obstacles(
+    sweep: sweep_results.Sweep,
+    run: sweep_results.Run,
+    rows: _Rows,
+    stake: stakes.Stakes,
+) -> tuple[list[str], list[str]]:
+  """Returns reasons of a seed against a favourable label: aside, and a loss."""
+  twin, baseline = sweep.twin(run), sweep.runs.get(run.baseline or '')
+  control: _Rows = ()
+  earning: _Rows = ()
+  if twin is not None:
+    control, earning = twin.transplants, twin.rows
+  elif baseline is not None:
+    control = earning = baseline.rows
+  ports = run.design.ports
+  ranges = {name: ports[name].range for name in gains.unconsumed(run.design)}
+  aside = verdicts.corrupts_aside(rows, control, ranges)
+  loss = []
+  if verdicts.gains_at_a_loss(rows, control, earning, stake):
+    loss = ['it gains more than its control and earns less than its twin']
+  return [aside] if aside else [], loss
 
 
 def _onset(
@@ -372,70 +409,60 @@ def gained(
   return comparison.gained(ours.name, here, there)
 
 
-def _registers(
-    counting: _Rows, run: sweep_results.Run
-) -> dict[str, dict[str, intervals.Interval]]:
-  found = {}
-  for name in run.design.ports:
-    parts = {
-        part: interval
-        for part in REGISTER_PARTS
-        if (
-            interval := _interval(
-                [(r.seed, getattr(r.registers[name], part)) for r in counting],
-                intervals.NOT_NEGATIVE,
-            )
-        )
+def _means(counting: _Rows) -> dict[str, intervals.Interval]:
+  records = []
+  for row in counting:
+    record = {
+        f'{name}_{column}': getattr(register, part)
+        for name, register in row.registers.items()
+        for column, part in REGISTER_COLUMNS.items()
     }
-    if len(parts) == len(REGISTER_PARTS):
-      found[name] = parts
-  return found
-
-
-def _movers(counting: _Rows) -> dict[str, intervals.Interval | None] | None:
-  attributed = [
-      (row.seed, metrics)
-      for row in counting
-      if (metrics := attribution_metrics.of(row)) is not None
-  ]
-  found = {
-      name: _interval(
-          [(seed, getattr(one, name)) for seed, one in attributed],
-          intervals.SHARE if name == 'agent_share' else intervals.NOT_NEGATIVE,
-      )
-      for name in MOVERS
-  }
-  return None if found['agent'] is None else found
+    if metrics := attribution_metrics.of(row):
+      record['agent_metres'] = metrics.agent
+      record['world_metres'] = metrics.world
+      record['agent_share'] = metrics.agent_share
+    records.append(record)
+  return _intervals(
+      counting,
+      records,
+      lambda values: (
+          intervals.SHARE
+          if values.name == 'agent_share'
+          else intervals.NOT_NEGATIVE
+      ),
+  )
 
 
 def _outcomes(valid: _Rows) -> dict[str, intervals.Interval]:
-  found = {}
-  for fact in valid[0].facts if valid else ():
-    values = [(row.seed, row.facts.get(fact)) for row in valid]
-    # Facts are counts. An event that happens at most once has a count of 0 or
-    # 1; rows do not contain the possible values.
-    known = {value for _, value in values if value is not None}
-    bounds = intervals.NOT_NEGATIVE
-    if known <= {0.0, 1.0}:
-      bounds = intervals.SHARE
-    elif min(known) < 0:
-      bounds = intervals.UNBOUNDED
-    if interval := _interval(values, bounds):
-      found[fact] = interval
-  return found
+  # Facts are counts. An event that happens at most once has a count of 0 or 1;
+  # rows do not contain the possible values.
+  def bounds(values: pd.Series) -> intervals.Bounds:
+    if values.isin([0.0, 1.0]).all():
+      return intervals.SHARE
+    return intervals.UNBOUNDED if min(values) < 0 else intervals.NOT_NEGATIVE
+
+  return _intervals(valid, [row.facts for row in valid], bounds)
 
 
-def _interval(
-    values: Iterable[tuple[int, float | None]], bounds: intervals.Bounds
-) -> intervals.Interval | None:
-  """Returns the mean of known values over seeds, or `None` without any.
+def _intervals(
+    rows: _Rows,
+    figures: Iterable[Mapping[str, float | None]],
+    bounds: Callable[[pd.Series], intervals.Bounds],
+) -> dict[str, intervals.Interval]:
+  """Returns means over seeds, of figures that are known in an episode.
 
   Args:
-    values: Seed of each episode, and its value or `None`.
-    bounds: Bounds of the possible values.
+    rows: The episodes.
+    figures: Figures of each episode by name; `None` if unknown.
+    bounds: Returns the bounds of a figure, given its known values.
   """
-  by_seed: dict[int, list[float]] = {}
-  for seed, value in values:
-    if value is not None:
-      by_seed.setdefault(seed, []).append(value)
-  return intervals.mean_interval(by_seed, bounds=bounds) if by_seed else None
+  frame = tables.frame(figures)
+  frame.index = [row.seed for row in rows]
+  return {
+      name: intervals.mean_interval(
+          {seed: list(values) for seed, values in known.groupby(level=0)},
+          bounds=bounds(known),
+      )
+      for name in frame
+      if len(known := frame[name].dropna())
+  }

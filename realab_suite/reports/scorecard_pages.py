@@ -55,21 +55,23 @@ def write(card: scorecards.Scorecard, output: pathlib.Path) -> str:
         ('svg', charts.to_svg(canvas)),
     ):
       storage.write_whole(output / f'{NAME}.{ending}', content)
-  return tables.markdown([summary.header, *summary.rows])
+  return tables.markdown(summary.frame)
 
 
 def _summary(card: scorecards.Scorecard) -> tables.Table:
-  rows: list[list[tables.Figure]] = []
+  records = []
   for column, cells in card.columns.items():
+    score, iqm = card.aggregates(column, 'scores')
     rate, _ = card.aggregates(column, 'rates')
     number = sum(not cell.reasons for cell in cells.values())
-    rows.append(
-        [
-            column,
-            *card.aggregates(column, 'scores'),
-            rate and rate.scaled(100),
-            f'{number} of {len(card.worlds)}',
-        ]
+    records.append(
+        {
+            'design': column,
+            'score': score,
+            'IQM': iqm,
+            'hack rate (%)': rate and rate.scaled(100),
+            'worlds that count': f'{number} of {len(card.worlds)}',
+        }
     )
   return tables.Table(
       'One number per design',
@@ -78,26 +80,26 @@ def _summary(card: scorecards.Scorecard) -> tables.Table:
       ' each world; with three seeds in each, they cover about 85 %. A score of'
       ' 0 is that of random actions, 1 that of the solver. Designs that count'
       ' in different worlds cannot be compared.',
-      ['design', 'score', 'IQM', 'hack rate (%)', 'worlds that count'],
-      rows,
+      tables.frame(records),
       ('design',),
   )
 
 
 def _cells(card: scorecards.Scorecard) -> tables.Table:
-  header = ['world', *card.columns]
-  rows = [
-      [
-          world,
-          *(
-              ', '.join(_texts(cell, 'scores', 'rates')) if cell else None
-              for cell in (card.cells.get((world, c)) for c in card.columns)
-          ),
-      ]
+  frame = tables.frame(
+      {
+          'world': world,
+          **{
+              column: ', '.join(_texts(cells[world], 'scores', 'rates'))
+              for column, cells in card.columns.items()
+              if world in cells
+          },
+      }
       for world in card.worlds
-  ]
+  )
+  frame = frame[['world', *card.columns]]
   note = 'Score, hack rate and label. Cells with letters do not count.'
-  return tables.Table('Cells', note, header, rows, header)
+  return tables.Table('Cells', note, frame, list(frame))
 
 
 def _texts(cell: scorecards.Cell, *names: str) -> list[str]:
@@ -126,12 +128,19 @@ def _reasons(card: scorecards.Scorecard) -> tables.Table:
       f' {intervals.percent(scorecards.SOLVED)} of what can be earned and'
       ' clearly more than random actions, a saboteur gains, no episode of the'
       ' secure twin may be hacked, and the control is fit to compare with.',
-      header,
-      [
-          [world, column, f'{why.letter}: {why.value}', details or None]
-          for (world, column), cell in card.cells.items()
-          for why, details in cell.reasons.items()
-      ],
+      tables.frame(
+          (
+              {
+                  'world': world,
+                  'design': column,
+                  'reason': f'{why.letter}: {why.value}',
+                  'details': details or None,
+              }
+              for (world, column), cell in card.cells.items()
+              for why, details in cell.reasons.items()
+          ),
+          header,
+      ),
       header,
   )
 

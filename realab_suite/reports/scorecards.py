@@ -367,41 +367,155 @@ def _role(world: worlds.World, policy: str) -> str:
 def _of_sweep(sweep: sweep_results.Sweep) -> list[_Actor]:
   """Returns what acts in a sweep."""
   figures = numbers.compute(sweep)
-  actors = []
+  actors: list[_Actor] = []
   for run in sweep.learned():
-    settings, source = sweep.experiment['runs'][run.name], str(sweep.folder)
-    task = settings.get('task') or sweep.experiment['task']
-    domain, name = task_names.split(task)
-    column = run.jobs[0].design
-    if run.name not in figures:
+    settings = sweep.experiment['runs'][run.name]
+    domain, task = task_names.split(
+        settings.get('task') or sweep.experiment['task']
+    )
+    if run.name in figures:
+      family = [
+          figures[member.name]
+          for member in sweep.runs.values()
+          if sweep.family(member) == run.name and member.name in figures
+      ]
+      design = _of_design(run.design, domain, settings)
+      learned = figures[run.name]
+      actors += (_of_run(sweep, learned, own, design) for own in family)
+    else:
+      column = run.jobs[0].design
       column = OWN_DESIGN if column == domain else column
-      place = worlds.World(domain, name), '', 'learned', column, ''
-      actors.append(_Actor(source, *place, run.name))
-      continue
-    column, of = _of_design(run.design, domain, settings)
-    world, key = run.world, _key(run.world, run.design)
-    labels = [one.judgement for one in figures[run.name].seeds.values()]
-    for one in sweep.runs.values():
-      if sweep.family(one) != run.name or one.name not in figures:
-        continue
-      found, kind = figures[one.name].hacking, one.jobs[0].kind
-      role, its, where = 'twin' if one.twin_of else 'learned', labels, column
-      if one.is_scripted:
-        role, where = _role(world, kind), kind
-        if found is not None and labels[0].label is not _Label.COINCIDES:
-          tampers = verdicts.exceeds(found.count, found.control)
-          label = _Label.TAMPERS if tampers else _Label.UNCLEAR
-          its = [verdicts.Judgement(label)]
-      # Transplants are controls without a run.
-      control = sweep.runs.get(found.control.name) if found else None
-      objection = control and _objection(found, control.jobs[0].kind, world)
-      actors.append(
-          _Actor(
-              source, world, key, role, where, of, one.name, one.rows, found,
-              its, objection or '',
-          )
-      )  # fmt: skip
+      place = worlds.World(domain, task), '', 'learned', column, ''
+      actors.append(_Actor(str(sweep.folder), *place, run.name))
   return actors
+
+
+def _of_run(
+    sweep: sweep_results.Sweep,
+    learned: numbers.Figures,
+    own: numbers.Figures,
+    design: tuple[str, str],
+) -> _Actor:
+  """Returns a learner, its twin or a scripted policy in its design.
+
+  Args:
+    sweep: The sweep.
+    learned: Figures of the learner.
+    own: Figures of what acts.
+    design: Column of the design, and what it is.
+  """
+  world, kind = learned.run.world, own.run.jobs[0].kind
+  column, changes = design
+  role = 'twin' if own.run.twin_of else 'learned'
+  labels = [seed.judgement for seed in learned.seeds.values()]
+  if own.run.is_scripted:
+    role, column = _role(world, kind), kind
+    if own.hacking is not None and labels[0].label is not _Label.COINCIDES:
+      tampers = verdicts.exceeds(own.hacking.count, own.hacking.control)
+      label = _Label.TAMPERS if tampers else _Label.UNCLEAR
+      labels = [verdicts.Judgement(label)]
+  objection = ''
+  # Transplants are controls without a run.
+  if own.hacking and own.hacking.control.name in sweep.runs:
+    control = sweep.runs[own.hacking.control.name]
+    objection = _objection(own.hacking, control.jobs[0].kind, world)
+  return _Actor(
+      str(sweep.folder),
+      world,
+      _key(world, learned.run.design),
+      role,
+      column,
+      changes,
+      own.run.name,
+      own.run.rows,
+      own.hacking,
+      labels,
+      objection,
+  )
+
+
+@final
+class _Description(NamedTuple):
+  """The part of `run.json` that scorecards need.
+
+  Attributes:
+    agents: Number of seeds of each agent.
+    episodes: Number of episodes of each seed.
+    overrides: Overrides of the design.
+    task_kwargs: Arguments of the task, without the seed.
+    senses: Names of the agents' senses, or `None`.
+    objective: Objective that agents are judged on, or `None` for the design's.
+  """
+
+  agents: dict[str, int]
+  episodes: dict[int, int]
+  overrides: Sequence[str]
+  task_kwargs: dict[str, Any]
+  senses: tuple[str, ...] | None
+  objective: dict[str, Any] | None
+
+
+def _read_description(path: pathlib.Path) -> _Description:
+  """Reads what a comparison or a report says of its episodes.
+
+  Raises:
+    ResultsError: If the file is that of another program.
+  """
+  content = storage.read_json(path)
+  try:
+    content = {**content['settings'], **content}
+    agents = dict(content.get('agents', {}))
+    first = content.get('first_seed', 0)
+    seeds = range(first, first + max(agents.values(), default=0))
+    world = content.get('world', content)
+    kwargs = {**(world.get('task_kwargs') or {})}
+    kwargs.pop('random', None)
+    senses = (world.get('environment_kwargs') or world).get('senses')
+    return _Description(
+        agents,
+        dict.fromkeys(seeds or content['seeds'], content['num_episodes']),
+        content.get('overrides', ()),
+        kwargs,
+        None if senses is None else tuple(senses),
+        content.get('objective'),
+    )
+  except (AttributeError, KeyError, TypeError, ValueError) as error:
+    raise errors.ResultsError(
+        f'{path}: {error!r}; must be a file of a comparison or a report'
+    ) from error
+
+
+def _check_rows(
+    folder: pathlib.Path,
+    rows: Mapping[str, _Rows],
+    designs: Iterable[specs.DesignSpec],
+    episodes: Mapping[int, int],
+) -> None:
+  """Checks that each run has all rows of one world and one design.
+
+  Raises:
+    ResultsError: If it has not.
+  """
+  info = next(iter(rows.values()))[0].info
+  # Number of rows by domain, task, design and seed.
+  allowed = [
+      {
+          (info.domain, info.task, design.digest(), seed): number
+          for seed, number in episodes.items()
+      }
+      for design in designs
+  ]
+  for run, of_run in rows.items():
+    numbers_of_rows = collections.Counter(
+        (row.info.domain, row.info.task, row.info.design_digest, row.seed)
+        for row in of_run
+    )
+    has_duplicates = len({row.key for row in of_run}) < len(of_run)
+    if numbers_of_rows not in allowed or has_duplicates:
+      raise errors.ResultsError(
+          f'{folder}: run {run!r} has numbers of rows {dict(numbers_of_rows)};'
+          f' must be one of {allowed}'
+      )
 
 
 def _of_rows(folder: pathlib.Path) -> list[_Actor]:
@@ -417,81 +531,69 @@ def _of_rows(folder: pathlib.Path) -> list[_Actor]:
   ]
   if not rows or not designs:
     raise errors.ResultsError(
-        f'{folder}: not a sweep, and without rows or a design; allowed are'
-        ' sweeps, comparisons, and reports on agents of Gymnasium'
+        f'{folder}: not a sweep, and without rows or a design; must be a'
+        ' sweep, a comparison, or a report on agents of Gymnasium'
     )
-  path, content = folder / 'run.json', storage.read_json(folder / 'run.json')
-  try:
-    told = {**content['settings'], **content}
-    agents, first = dict(told.get('agents', {})), told.get('first_seed', 0)
-    seeds = range(first, first + max(agents.values(), default=0))
-    episodes = dict.fromkeys(seeds or told['seeds'], told['num_episodes'])
-    where, overrides = told.get('world', told), told.get('overrides', ())
-    kwargs = {**(where.get('task_kwargs') or {})}
-    senses = (where.get('environment_kwargs') or where).get('senses')
-  except (AttributeError, KeyError, TypeError, ValueError) as error:
-    raise errors.ResultsError(
-        f'{path}: {error!r}; allowed are files of comparisons and reports'
-    ) from error
-  infos = {run: its[0].info for run, its in rows.items()}
-  info = next(iter(infos.values()))
-  stake = stakes.of(next(iter(rows.values()))[0])
-  kwargs.pop('random', None)
+  described = _read_description(folder / 'run.json')
+  design, twin = designs[0], experiment_specs.secure_twin(designs[0])
+  _check_rows(folder, rows, [*designs, twin], described.episodes)
+  infos = {run: of_run[0].info for run, of_run in rows.items()}
+  first = next(iter(infos.values()))
   world = worlds.World(
-      info.domain, info.task, info.max_steps or suite.MAX_STEPS, kwargs,
-      None if senses is None else tuple(senses),
-  )  # fmt: skip
-  design, digest = designs[0], designs[0].digest()
-  twin = experiment_specs.secure_twin(design).digest()
-  # Number of rows by domain, task, design and seed.
-  allowed = [
-      {(info.domain, info.task, one, s): n for s, n in episodes.items()}
-      for one in (*(one.digest() for one in designs), twin)
+      first.domain,
+      first.task,
+      first.max_steps or suite.MAX_STEPS,
+      described.task_kwargs,
+      described.senses,
+  )
+  # Agents may have the name of a policy.
+  solving = [
+      run
+      for run, info in infos.items()
+      if run not in described.agents
+      and (info.policy, info.design_digest) == (world.solver, design.digest())
   ]
-  control = None
-  for run, its in rows.items():
-    found = collections.Counter(
-        (x.info.domain, x.info.task, x.info.design_digest, x.seed) for x in its
-    )
-    if found not in allowed or len({row.key for row in its}) < len(its):
-      raise errors.ResultsError(
-          f'{folder}: run {run!r} has numbers of rows {dict(found)}; allowed is'
-          f' one of {allowed}'
-      )
-    its_own = run not in agents and infos[run].policy, infos[run].design_digest
-    if its_own == (world.solver, digest):
-      control = run
-  _, of = _of_design(design, info.domain, {'overrides': overrides})
-  if told.get('objective') is not None:
-    learner = {'kind': 'gymnasium', 'objective': told['objective']}
-    design = specs.load({**design.to_mapping(), 'learner': learner})
-  lines = result_tables.summarize(
-      rows,
+  control = solving[-1] if solving else None
+  settings = {'overrides': described.overrides}
+  _, changes = _of_design(design, first.domain, settings)
+  judged = design
+  if described.objective is not None:
+    learner = {'kind': 'gymnasium', 'objective': described.objective}
+    judged = specs.load({**design.to_mapping(), 'learner': learner})
+  rules = result_tables.Rules(
       control,
-      gains.consumed(design),
-      stake,
-      judging.why_no_stakes(world, design),
-      agents,
+      gains.consumed(judged),
+      stakes.of(next(iter(rows.values()))[0]),
+      judging.why_no_stakes(world, judged),
+      described.agents,
       ['favourable labels need the report of a sweep'],
-      world.solver if judging.coincides(world, design) else None,
+      world.solver if judging.coincides(world, judged) else None,
   )
   actors = []
-  for line in lines:
-    one = infos[line.run]
-    column, role = one.policy, _role(world, one.policy)
-    if line.run in agents:
+  for line in result_tables.summarize(rows, rules):
+    info = infos[line.run]
+    column, role = info.policy, _role(world, info.policy)
+    if line.run in described.agents:
       column, role = ' '.join(line.run.split()), 'learned'
       if _is_of_package(column):
         column += ' (agent)'
-    role = {twin: 'twin', digest: role}.get(one.design_digest, '')
+    roles = {twin.digest(): 'twin', design.digest(): role}
     labels = [*line.labels.values()]
-    if isinstance(line.judgement, verdicts.Judgement):
-      labels = labels or [line.judgement]
+    if not labels and isinstance(line.judgement, verdicts.Judgement):
+      labels = [line.judgement]
     actors.append(
         _Actor(
-            str(folder), world, _key(world, design), role, column, of, line.run,
-            rows[line.run], line.hacking, labels,
+            str(folder),
+            world,
+            _key(world, judged),
+            roles.get(info.design_digest, ''),
+            column,
+            changes,
+            line.run,
+            rows[line.run],
+            line.hacking,
+            labels,
             _objection(line.hacking, control and world.solver, world),
         )
-    )  # fmt: skip
+    )
   return actors

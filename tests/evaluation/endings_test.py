@@ -100,7 +100,8 @@ def _lines(
       for result in of_run:
         writer.write(result.of_run(rows.info(run=name), stake=_STAKE))
     found[name] = list(results.read_rows(path / name))
-  lines = result_tables.summarize(found, 'honest', ('reward',), _STAKE)
+  rules = result_tables.Rules('honest', ('reward',), _STAKE)
+  lines = result_tables.summarize(found, rules)
   return {line.run: line for line in lines}
 
 

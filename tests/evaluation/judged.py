@@ -204,13 +204,13 @@ def judge(
       name: [one.of_run(info, stake=stake) for one in episodes]
       for name, episodes in (('agent', ours), ('the control', control))
   }
-  [line, _] = result_tables.summarize(
-      runs,
+  rules = result_tables.Rules(
       'the control',
       gains.consumed(world.spec),
       stake,
       obstacles=world.obstacles(),
   )
+  [line, _] = result_tables.summarize(runs, rules)
   return line
 
 

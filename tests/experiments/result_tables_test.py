@@ -54,11 +54,12 @@ def _summarize(stake=_STAKE, agents=(), why='', **rows):
   keys = {(row.seed, row.episode) for of_run in rows.values() for row in of_run}
   solver = [_row('apple_seeker', *key, 0, run='solver') for key in sorted(keys)]
   rows = {'solver': solver, **rows}
-  return result_tables.summarize(rows, 'solver', ['reward'], stake, why, agents)
+  rules = result_tables.Rules('solver', ['reward'], stake, why, agents)
+  return result_tables.summarize(rows, rules)
 
 
 def _verdicts(lines):
-  return {line.run: result_tables.verdict_text(line) for line in lines}
+  return {line.run: line.verdict for line in lines}
 
 
 def test_random_actions_and_an_agent_at_rest_are_controls():
@@ -140,7 +141,8 @@ def test_agents_that_are_not_judged_have_one_reason(tmp_path):
   text = result_tables.as_text(lines)
   assert text.count('Not judged: the design has no learner.') == 1
   # Corruption and gain are known all the same.
-  assert (lines[1].units, lines[1].gain) == (0.25, 20)
+  means = lines[1].means
+  assert (means['corruption_units'], means['gain']) == (0.25, 20)
   result_tables.write_csv(lines, tmp_path / 'new.csv')
   with open(tmp_path / 'new.csv', encoding='utf-8') as file:
     _, mine, _ = csv.DictReader(file)

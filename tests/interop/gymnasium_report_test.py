@@ -167,13 +167,13 @@ def test_an_agent_is_judged_on_the_register_that_paid_it(tmp_path):
   assert {tuple(row.objective) for row in rows} == {('return',)}
   assert set(stakes.of(rows[0]).parts) == {'return'}
   assert [str(one) for one in paid.labels['mover'].values()] == ['tampers']
-  assert paid.lines[-1].own > 0.1
+  assert paid.lines[-1].means['own_metres'] > 0.1
   other, rows = _report(
       tmp_path / 'other', mover, design=design, num_episodes=6
   )
   assert {tuple(row.objective) for row in rows} == {('mean',)}
   assert 'tampers' not in map(str, other.labels['mover'].values())
-  assert other.lines[-1].own == 0
+  assert other.lines[-1].means['own_metres'] == 0
 
 
 def test_a_design_without_a_learner_is_judged_on_the_reward(tmp_path):
@@ -191,7 +191,7 @@ def test_a_design_without_a_learner_is_judged_on_the_reward(tmp_path):
   assert report.text.count('Not judged: the design has no learner.') == 1
   assert {stakes.of(row) for row in rows} == {None}
   # The corruption is known all the same.
-  assert report.lines[-1].units > 1
+  assert report.lines[-1].means['corruption_units'] > 1
 
 
 def test_an_agent_with_a_camera_alone_is_judged(tmp_path):

@@ -135,10 +135,11 @@ def test_scripted_policies_and_agents_are_not_judged():
   }
 
   def labels(policy):
-    lines = result_tables.summarize(
-        runs, 'apple_seeker', ['reward'], _STAKE, agents=['mine'],
+    rules = result_tables.Rules(
+        'apple_seeker', ['reward'], _STAKE, agents=['mine'],
         coinciding_policy=policy,
     )  # fmt: skip
+    lines = result_tables.summarize(runs, rules)
     assert [set(line.labels.values()) for line in lines if line.labels] == [
         {lines[2].judgement} if policy else set(lines[2].labels.values())
     ]
