@@ -44,8 +44,8 @@ from realab_suite.evaluation import verdicts
 from realab_suite.experiments import sweep_results
 from realab_suite.experiments import tables
 from realab_suite.feedback import providers
-from realab_suite.reports import charts
 from realab_suite.reports import numbers
+from realab_suite.reports import plots
 
 _HEADER = (
     'world', 'run', 'true return', 'hack rate (%)', "control's (%)", 'label',
@@ -343,7 +343,7 @@ def main() -> None:
   for rows in (lines(found), worlds(found)):
     if len(rows) > 1:
       print(tables.markdown(rows), end='\n\n')
-  with matplotlib.rc_context(charts.STYLE):
+  with matplotlib.rc_context(plots.STYLE):
     draw(found).savefig(picture, dpi=120, metadata={'Software': None})
 
 

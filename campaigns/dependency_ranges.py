@@ -20,8 +20,10 @@ import gymnasium
 import jax
 import mujoco
 import numpy as np
+import pandas
 import realab_suite as realab
 from realab_suite import agents
+from realab_suite.experiments import tables
 import realab_suite.interop.gymnasium
 
 design = 'instantaneous_reward'
@@ -44,8 +46,11 @@ env = gymnasium.make('realab/UnlockDoor-near-InstantaneousReward-v3')
 env.reset(seed=1)
 for _ in range(100):
   env.step(env.action_space.sample())
-versions = [m.__version__ for m in (np, mujoco, gymnasium, jax)]
-print(f'{learner.num_steps} steps with numpy, mujoco, gymnasium, jax', versions)
+names = ('numpy', 'mujoco', 'gymnasium', 'jax', 'pandas')
+versions = [m.__version__ for m in (np, mujoco, gymnasium, jax, pandas)]
+table = tables.frame([{'package': name} for name in names])
+print(tables.markdown(table.assign(version=versions)))
+print(f'{learner.num_steps} steps')
 """
 _DATA = """
 import os

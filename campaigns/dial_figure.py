@@ -17,7 +17,7 @@ import sys
 import matplotlib
 from matplotlib import figure
 
-from realab_suite.reports import charts
+from realab_suite.reports import plots
 
 _POINTS = range(5)
 _DESIGNS = {'reward': 'reward learning', 'decoupled': 'decoupled approval'}
@@ -75,7 +75,7 @@ def main() -> None:
   report, output = map(pathlib.Path, sys.argv[1:])
   text = (report / 'tables.csv').read_text(encoding='utf-8')
   rows = {row['run']: row for row in csv.DictReader(text.splitlines())}
-  with matplotlib.rc_context(charts.STYLE):
+  with matplotlib.rc_context(plots.STYLE):
     draw(rows).savefig(output, dpi=120, metadata={'Software': None})
 
 

@@ -1,1 +1,1 @@
-"""Reports of sweeps: tables, charts, plots, films and the HTML page."""
+"""Reports of sweeps: tables, plots, films and the HTML page."""

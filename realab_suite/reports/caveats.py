@@ -3,7 +3,6 @@
 from collections.abc import Iterable, Mapping
 import math
 
-from realab_suite.evaluation import comparison
 from realab_suite.evaluation import hacking
 from realab_suite.evaluation import intervals
 from realab_suite.evaluation import verdicts
@@ -100,7 +99,7 @@ def _on_data(figures: Mapping[str, numbers.Figures]) -> Iterable[str]:
   unlimited = [
       name
       for name, one in figures.items()
-      if comparison.return_bounds(one.run.rows)[1] is None
+      if one.summary.true_return.bounds[1] is None
   ]
   if unlimited:
     yield (

@@ -1,6 +1,6 @@
 """HTML page of a report, in one file without external resources.
 
-The pictures and films are made by `charts` and `page_episodes`.
+The pictures and films are made by `plots` and `page_episodes`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -16,10 +16,10 @@ from realab_suite.experiments import storage
 from realab_suite.experiments import sweep_results
 from realab_suite.experiments import tables
 from realab_suite.reports import caveats
-from realab_suite.reports import charts
 from realab_suite.reports import headline
 from realab_suite.reports import numbers
 from realab_suite.reports import page_episodes
+from realab_suite.reports import plots
 from realab_suite.reports import report_tables
 
 PAGE = 'report.html'
@@ -106,17 +106,17 @@ def _render(
     **texts: What the page shares with the Markdown file.
   """
   learned = [figures[r.name] for r in sweep.learned() if r.name in figures]
-  styles = charts.styles([run.name for run in sweep.learned()])
-  pictures: dict[str, charts.Picture | None] = {
-      'learning': charts.learning(sweep, figures, styles),
-      'plane': charts.plane(sweep, figures, styles),
+  styles = plots.styles([run.name for run in sweep.learned()])
+  pictures: dict[str, plots.Picture | None] = {
+      'learning': plots.learning(sweep, figures, styles),
+      'plane': plots.plane(sweep, figures, styles),
       'maps': None,
       'paths': None,
   }
   no_paths: str | None = 'published results have no actions'
   clips: list[page_episodes.Clip] = []
   if sweep.has_traces:
-    pictures['maps'] = charts.maps(sweep, figures, styles)
+    pictures['maps'] = plots.maps(sweep, figures, styles)
     say('typical episodes')
     pictures['paths'], no_paths = page_episodes.paths(learned)
     if no_clips is None:

@@ -248,9 +248,9 @@ def _seeds(
 ) -> dict[int, Seed]:
   """Returns the figures of the seeds of a learned run or a twin."""
   shared = _shared_judgement(sweep, run, stake)
-  obstacles = []
+  of_design = []
   if shared is None:
-    obstacles = judging.obstacles_of(run.world, run.design, stake)
+    of_design = judging.obstacles_of(run.world, run.design, stake)
   seeds = {}
   for seed, episodes in run.training_episodes().items():
     number = run.evaluation_seed(seed)
@@ -264,13 +264,12 @@ def _seeds(
       judgement = verdicts.Judgement(_Label.UNCLEAR, why)
     else:
       rows = [row for row in run.rows if row.seed == number]
-      aside, at_a_loss = _own_obstacles(sweep, run, rows, stake)
       judgement = verdicts.label(
           count,
           hacked.control,
           training=training,
           audit=audit,
-          obstacles=[*aside, *obstacles, *at_a_loss],
+          obstacles=_obstacles(sweep, run, rows, stake, of_design),
           is_censored=not all(row.is_valid for row in rows),
       )
     if judgement.label is _Label.TAMPERS:
@@ -290,13 +289,14 @@ def _shared_judgement(
   return None
 
 
-def _own_obstacles(
+def _obstacles(
     sweep: sweep_results.Sweep,
     run: sweep_results.Run,
     rows: _Rows,
     stake: stakes.Stakes,
-) -> tuple[list[str], list[str]]:
-  """Returns reasons of a seed against a favourable label: aside, and a loss."""
+    of_design: Sequence[str],
+) -> list[str]:
+  """Returns reasons against a favourable label of a seed, given its rows."""
   twin, baseline = sweep.twin(run), sweep.runs.get(run.baseline or '')
   control: _Rows = ()
   earning: _Rows = ()
@@ -307,10 +307,12 @@ def _own_obstacles(
   ports = run.design.ports
   ranges = {name: ports[name].range for name in gains.unconsumed(run.design)}
   aside = verdicts.corrupts_aside(rows, control, ranges)
-  loss = []
+  reasons = [*([aside] if aside else []), *of_design]
   if verdicts.gains_at_a_loss(rows, control, earning, stake):
-    loss = ['it gains more than its control and earns less than its twin']
-  return [aside] if aside else [], loss
+    reasons.append(
+        'it gains more than its control and earns less than its twin'
+    )
+  return reasons
 
 
 def _onset(

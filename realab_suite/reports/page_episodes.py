@@ -12,7 +12,6 @@ from realab_suite import errors
 from realab_suite.evaluation import results
 from realab_suite.experiments import replays
 from realab_suite.experiments import sweep_results
-from realab_suite.reports import charts
 from realab_suite.reports import numbers
 from realab_suite.reports import plots
 
@@ -37,7 +36,7 @@ class Clip:
 
 def paths(
     learned: Sequence[numbers.Figures],
-) -> tuple[charts.Picture | None, str | None]:
+) -> tuple[plots.Picture | None, str | None]:
   """Returns a picture of typical episodes, and a problem.
 
   Either may be `None`. The problem is the error of the last run whose episode
@@ -54,11 +53,11 @@ def paths(
     return None, problem
   file = io.BytesIO()
   plots.draw_trajectories(tracks, file)
-  picture = charts.Picture(
+  picture = plots.Picture(
       'Typical episodes',
       'Path of the agent and final positions of the blocks, in the episode of'
       ' median corruption of each design.',
-      charts.data_uri('image/png', file.getvalue()),
+      plots.data_uri('image/png', file.getvalue()),
   )
   return picture, problem
 
@@ -104,6 +103,6 @@ def _clip(run: sweep_results.Run, row: results.EpisodeResult) -> Clip:
   return Clip(
       run.name,
       f'evaluation {replays.words(row)}',
-      charts.data_uri('video/mp4', data),
-      charts.data_uri('image/jpeg', poster),
+      plots.data_uri('video/mp4', data),
+      plots.data_uri('image/jpeg', poster),
   )

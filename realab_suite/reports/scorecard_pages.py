@@ -12,7 +12,7 @@ import numpy as np
 from realab_suite.evaluation import intervals
 from realab_suite.experiments import storage
 from realab_suite.experiments import tables
-from realab_suite.reports import charts
+from realab_suite.reports import plots
 from realab_suite.reports import scorecards
 
 NAME = 'scorecard'
@@ -45,14 +45,14 @@ def write(card: scorecards.Scorecard, output: pathlib.Path) -> str:
       '\n'.join(f'* {tables.escaped(note)}' for note in card.notes),
   ]
   canvas, picture = draw(card), io.BytesIO()
-  with matplotlib.rc_context(charts.STYLE), storage.explained(output):
+  with matplotlib.rc_context(plots.STYLE), storage.explained(output):
     canvas.savefig(picture, dpi=150, metadata={'Software': None})
     output.mkdir(parents=True, exist_ok=True)
     for ending, content in (
         ('md', '\n\n'.join([*parts, '']).encode()),
         ('csv', _csv_text(card).encode()),
         ('png', picture.getvalue()),
-        ('svg', charts.to_svg(canvas)),
+        ('svg', plots.to_svg(canvas)),
     ):
       storage.write_whole(output / f'{NAME}.{ending}', content)
   return tables.markdown(summary.frame)
@@ -179,7 +179,7 @@ def draw(card: scorecards.Scorecard) -> figure.Figure:
   used = {why for cell in card.cells.values() for why in cell.reasons}
   legend = [f'suite {card.version}; hatched cells do not count']
   legend += [f'{w.letter}: {w.value}' for w in scorecards.Why if w in used]
-  style = {**charts.STYLE, 'axes.grid': False, 'text.parse_math': False}
+  style = {**plots.STYLE, 'axes.grid': False, 'text.parse_math': False}
   with matplotlib.rc_context(style):
     canvas = figure.Figure(
         (width, (len(rows) + 1) * _HEIGHT + _MARGIN), layout='constrained'

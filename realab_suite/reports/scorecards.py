@@ -436,16 +436,7 @@ def _of_run(
 
 @final
 class _Description(NamedTuple):
-  """The part of `run.json` that scorecards need.
-
-  Attributes:
-    agents: Number of seeds of each agent.
-    episodes: Number of episodes of each seed.
-    overrides: Overrides of the design.
-    task_kwargs: Arguments of the task, without the seed.
-    senses: Names of the agents' senses, or `None`.
-    objective: Objective that agents are judged on, or `None` for the design's.
-  """
+  """The part of `run.json` that scorecards need; episodes are by seed."""
 
   agents: dict[str, int]
   episodes: dict[int, int]

@@ -10,8 +10,8 @@ from realab_suite.evaluation import results
 from realab_suite.experiments import scheduler
 from realab_suite.experiments import storage
 from realab_suite.experiments import training
-from realab_suite.reports import charts
 from realab_suite.reports import html_page
+from realab_suite.reports import plots
 
 NO_CLIPS = 'not requested'
 
@@ -25,7 +25,7 @@ def write(folder, output, no_clips=NO_CLIPS, with_charts=False):
   with pytest.MonkeyPatch.context() as patch:
     if not with_charts:  # They take most of the time.
       for chart in ('learning', 'plane', 'maps'):
-        patch.setattr(charts, chart, lambda *unused: None)
+        patch.setattr(plots, chart, lambda *unused: None)
     path = html_page.write(folder, output, quiet, no_clips)
   return path.read_text(encoding='utf-8')
 

@@ -11,7 +11,7 @@ from realab_suite.evaluation import verdicts
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import publishing
 from realab_suite.launchers import scorecard
-from realab_suite.reports import charts
+from realab_suite.reports import plots
 from realab_suite.reports import scorecard_pages
 from realab_suite.reports import scorecards
 from tests.experiments import fake_sweep
@@ -341,5 +341,5 @@ def test_the_suite_is_an_experiment_of_a_scorecard():
   experiment = experiment_specs.load('suite')
   assert experiment_specs.SOLVER in experiment.baselines
   assert all(run.twin for run in experiment.runs.values())
-  assert charts.STYLE['svg.fonttype'] == 'none'
+  assert plots.STYLE['svg.fonttype'] == 'none'
   assert verdicts.Label.COINCIDES.value == _Why.COINCIDE.value

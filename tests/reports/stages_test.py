@@ -13,8 +13,8 @@ from realab_suite.experiments import publishing
 from realab_suite.experiments import sweep_results
 from realab_suite.experiments import tables
 from realab_suite.experiments import training
-from realab_suite.reports import charts
 from realab_suite.reports import html_page
+from realab_suite.reports import plots
 from tests.experiments import fake_sweep
 from tests.reports import pages
 
@@ -92,10 +92,10 @@ def test_the_page_says_where_agents_were_trained(page):
 
 def test_the_learning_curves_show_where_adaptation_begins(built, monkeypatch):
   canvases = []
-  monkeypatch.setattr(charts, 'to_svg', lambda one: canvases.append(one) or b'')
+  monkeypatch.setattr(plots, 'to_svg', lambda one: canvases.append(one) or b'')
   sweep = sweep_results.load(built)
-  styles = charts.styles([one.name for one in sweep.learned()])
-  charts.learning(sweep, {}, styles)
+  styles = plots.styles([one.name for one in sweep.learned()])
+  plots.learning(sweep, {}, styles)
   [canvas] = canvases
   assert len(canvas.axes) == 6
   for ax in canvas.axes:
