@@ -14,10 +14,10 @@ INSTALL_LABMAZE = if $(PY) -c 'import sys; sys.exit(sys.version_info < (3, 13))'
 WORKERS = 2
 
 # Files with tests that need other extras than `.venv/dev` has.
-TESTS_OF_EXTRAS = tests/authors tests/datasets tests/engine/gl_test.py \
-	tests/experiments/offline_test.py \
-	tests/experiments/supervised_test.py tests/experiments/training_test.py \
-	tests/interop tests/launchers/data_test.py
+TESTS_OF_EXTRAS = tests/authors tests/doors/data tests/engine/gl_test.py \
+	tests/lab/experiments/offline_test.py \
+	tests/doors/browser/supervised_test.py tests/lab/experiments/training_test.py \
+	tests/doors tests/launchers/data_test.py
 
 .PHONY: help demo test lint docs check-release format clean
 

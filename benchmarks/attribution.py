@@ -16,10 +16,10 @@ from benchmarks import timing
 from realab_suite import policies
 from realab_suite import suite
 from realab_suite.engine import batch_environment
-from realab_suite.evaluation import attribution
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import traces
+from realab_suite.lab.attribution import attribution
 
 _SEED = 0
 _ROUNDS = 5

@@ -14,7 +14,7 @@ import numpy as np
 
 from benchmarks import timing
 from realab_suite import suite
-from realab_suite.interop.gymnasium import registration
+from realab_suite.doors.gymnasium import registration
 
 NUM_ENVS = 256
 _STEPS = 100

@@ -25,12 +25,12 @@ from pictures import pages
 from realab_suite import policies
 from realab_suite import suite
 from realab_suite import worlds
-from realab_suite.audit import aiming
-from realab_suite.audit import audits
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import results
 from realab_suite.feedback import specs
+from realab_suite.lab.audit import aiming
+from realab_suite.lab.audit import audits
 from realab_suite.policies import errands
 from realab_suite.policies import navigation
 

@@ -24,11 +24,11 @@ import numpy as np
 
 from benchmarks import timing
 from realab_suite.evaluation import monitors
-from realab_suite.experiments import experiment_specs
-from realab_suite.experiments import jobs
-from realab_suite.experiments import requirements
-from realab_suite.experiments import threads
-from realab_suite.experiments import training
+from realab_suite.lab.experiments import experiment_specs
+from realab_suite.lab.experiments import jobs
+from realab_suite.lab.experiments import requirements
+from realab_suite.lab.experiments import threads
+from realab_suite.lab.experiments import training
 
 _WORLDS = 256
 # Eight updates, and more than the 251 steps from one reset to the next.

@@ -25,9 +25,9 @@ from typing import Any, NamedTuple, final
 from campaigns import figure_lines
 from realab_suite import suite
 from realab_suite import worlds
-from realab_suite.audit import audits
-from realab_suite.audit import findings
 from realab_suite.feedback import specs
+from realab_suite.lab.audit import audits
+from realab_suite.lab.audit import findings
 
 CHANNELS = ('embedded', 'secure')
 MOST_SECONDS = 180.0

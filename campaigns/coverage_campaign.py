@@ -38,11 +38,11 @@ TESTS = (
     'tests/evaluation/episodes_by_hand_test.py',
     'tests/evaluation/independence_test.py',
     'tests/evaluation/results_test.py',
-    'tests/experiments/damaged_files_test.py',
-    'tests/experiments/finished_jobs_test.py',
-    'tests/experiments/packing_test.py',
-    'tests/experiments/storage_test.py',
-    'tests/experiments/training_test.py',
+    'tests/lab/experiments/damaged_files_test.py',
+    'tests/lab/experiments/finished_jobs_test.py',
+    'tests/lab/experiments/packing_test.py',
+    'tests/lab/experiments/storage_test.py',
+    'tests/lab/experiments/training_test.py',
     'tests/archive_test.py',
     'tests/engine/snapshot_test.py',
     'tests/engine/batch_snapshot_test.py',
@@ -71,7 +71,7 @@ TARGETS: Mapping[str, tuple[Sequence[str], float]] = {
         1.0,
     ),
     'rows': (['evaluation/results.py'], 1.0),
-    'storage': (['experiments/storage.py'], 1.0),
+    'storage': (['lab/experiments/storage.py'], 1.0),
 }
 
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from realab_suite import suite
 from realab_suite.engine import batch_environment
-from realab_suite.experiments import experiment_specs
+from realab_suite.lab.experiments import experiment_specs
 from realab_suite.policies import action_sets
 
 EXPERIMENT = 'decoupling_failures'

@@ -18,15 +18,15 @@ import math
 import pathlib
 import sys
 
-from realab_suite.evaluation import comparison
 from realab_suite.evaluation import evaluate
-from realab_suite.evaluation import intervals
-from realab_suite.evaluation import stakes
-from realab_suite.experiments import experiment_specs
-from realab_suite.experiments import jobs
-from realab_suite.experiments import scheduler
-from realab_suite.experiments import sweep_results
-from realab_suite.experiments import training
+from realab_suite.lab.experiments import experiment_specs
+from realab_suite.lab.experiments import jobs
+from realab_suite.lab.experiments import scheduler
+from realab_suite.lab.experiments import sweep_results
+from realab_suite.lab.experiments import training
+from realab_suite.lab.verdicts import comparison
+from realab_suite.lab.verdicts import intervals
+from realab_suite.lab.verdicts import stakes
 
 # Relative gain above which an episode is hacked, and own corruption in m above
 # which a register was moved.

@@ -37,13 +37,13 @@ import matplotlib
 from matplotlib import figure
 import numpy as np
 
-from realab_suite.agents import defences
 from realab_suite.config import validation
-from realab_suite.evaluation import intervals
-from realab_suite.evaluation import verdicts
-from realab_suite.experiments import sweep_results
-from realab_suite.experiments import tables
 from realab_suite.feedback import providers
+from realab_suite.lab.agents import defences
+from realab_suite.lab.experiments import sweep_results
+from realab_suite.lab.experiments import tables
+from realab_suite.lab.verdicts import intervals
+from realab_suite.lab.verdicts import verdicts
 from realab_suite.reports import numbers
 from realab_suite.reports import plots
 

@@ -22,9 +22,9 @@ import mujoco
 import numpy as np
 import pandas
 import realab_suite as realab
-from realab_suite import agents
-from realab_suite.experiments import tables
-import realab_suite.interop.gymnasium
+from realab_suite.lab import agents
+from realab_suite.lab.experiments import tables
+import realab_suite.doors.gymnasium
 
 design = 'instantaneous_reward'
 for domain in ('unlock_door', 'apple_maze'):
@@ -60,7 +60,7 @@ import gymnasium
 import minari
 import pyarrow
 from realab_suite import worlds
-from realab_suite.datasets import export, sources
+from realab_suite.doors.data import export, sources
 from realab_suite.feedback import specs
 
 source = sources.of_policy(

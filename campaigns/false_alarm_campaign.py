@@ -24,18 +24,18 @@ import numpy as np
 
 from campaigns import figure_lines
 from campaigns import foreign_worlds
-from realab_suite import judging
 from realab_suite import policies
 from realab_suite import worlds
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
-from realab_suite.evaluation import hacking
 from realab_suite.evaluation import results
-from realab_suite.evaluation import stakes
-from realab_suite.evaluation import verdicts
-from realab_suite.experiments import jobs
-from realab_suite.experiments import sweep_results
 from realab_suite.feedback import specs
+from realab_suite.lab.experiments import jobs
+from realab_suite.lab.experiments import sweep_results
+from realab_suite.lab.verdicts import hacking
+from realab_suite.lab.verdicts import judging
+from realab_suite.lab.verdicts import stakes
+from realab_suite.lab.verdicts import verdicts
 from realab_suite.policies import action_sets
 from realab_suite.policies import base
 from realab_suite.policies import random_keys

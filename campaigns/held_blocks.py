@@ -19,12 +19,12 @@ import sys
 
 import numpy as np
 
-from realab_suite.audit import aiming
 from realab_suite.engine import batch_environment
 from realab_suite.evaluation import batch_actors
-from realab_suite.experiments import experiment_specs
-from realab_suite.experiments import jobs
-from realab_suite.experiments import training
+from realab_suite.lab.audit import aiming
+from realab_suite.lab.experiments import experiment_specs
+from realab_suite.lab.experiments import jobs
+from realab_suite.lab.experiments import training
 
 
 def _watch(

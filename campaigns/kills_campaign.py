@@ -32,11 +32,11 @@ import numpy as np
 import yaml
 
 from campaigns import figure_lines
-from realab_suite.experiments import experiment_specs
-from realab_suite.experiments import jobs
-from realab_suite.experiments import scheduler
-from realab_suite.experiments import storage
-from realab_suite.experiments import training
+from realab_suite.lab.experiments import experiment_specs
+from realab_suite.lab.experiments import jobs
+from realab_suite.lab.experiments import scheduler
+from realab_suite.lab.experiments import storage
+from realab_suite.lab.experiments import training
 from tests import patience
 
 _COMMAND = ('-m', 'realab_suite.launchers.sweep')

@@ -23,8 +23,8 @@ from typing import Any, final
 from dm_env import specs as dm_env_specs
 import numpy as np
 
-from realab_suite import agents
 from realab_suite.engine import batch_time_steps
+from realab_suite.lab import agents
 
 _NUM_PLACES = 5
 _LENGTH = 100

@@ -45,20 +45,20 @@ _FIG = ('tests/evaluation/episode_figures_test.py',)
 _CLEAN = 'feedback/clean_contents.py'
 _ORACLE = ('tests/feedback/clean_oracle_test.py',)
 _LED = ('tests/evaluation/ledger_test.py', *_FIG)
-_COMPARISON = 'evaluation/comparison.py'
-_COM = ('tests/evaluation/comparison_test.py',)
-_STORAGE = 'experiments/storage.py'
-_TRA = ('tests/experiments/training_test.py',)
-_STO = ('tests/experiments/storage_test.py', *_TRA)
-_CRASH = ('tests/experiments/crash_test.py',)
+_COMPARISON = 'lab/verdicts/comparison.py'
+_COM = ('tests/lab/verdicts/comparison_test.py',)
+_STORAGE = 'lab/experiments/storage.py'
+_TRA = ('tests/lab/experiments/training_test.py',)
+_STO = ('tests/lab/experiments/storage_test.py', *_TRA)
+_CRASH = ('tests/lab/experiments/crash_test.py',)
 _RESULTS = 'evaluation/results.py'
 _RES = ('tests/evaluation/results_test.py',)
 _ENDINGS = 'evaluation/endings.py'
 _END = ('tests/evaluation/endings_test.py', '-k', 'every_end')
-_INTERVALS = 'evaluation/intervals.py'
-_INT = ('tests/evaluation/intervals_test.py',)
-_VERDICTS = 'evaluation/verdicts.py'
-_VER = ('tests/evaluation/verdicts_test.py',)
+_INTERVALS = 'lab/verdicts/intervals.py'
+_INT = ('tests/lab/verdicts/intervals_test.py',)
+_VERDICTS = 'lab/verdicts/verdicts.py'
+_VER = ('tests/lab/verdicts/verdicts_test.py',)
 
 MUTANTS = [
     # ---- Contract ------------------------------------------------------------
@@ -387,14 +387,14 @@ MUTANTS = [
     ),
     planting.Mutant(
         'storage', 'a folder of another configuration is accepted',
-        'experiments/training.py',
+        'lab/experiments/training.py',
         '    jobs.read_config(path)  # Refuses another configuration.\n', '',
         _TRA,
     ),
     planting.Mutant(
         'storage', 'changed results are accepted as done', _STORAGE,
         '    if _digest(path / name) != digest:', '    if not digest:',
-        ('tests/experiments/finished_jobs_test.py',),
+        ('tests/lab/experiments/finished_jobs_test.py',),
     ),
     planting.Mutant(
         'storage', 'only the last checkpoint is kept', _STORAGE,
@@ -418,21 +418,21 @@ MUTANTS = [
     ),
     planting.Mutant(
         'storage', 'a run continues on another machine unrecorded',
-        'experiments/training.py',
+        'lab/experiments/training.py',
         '      if not differences:\n', '      if differences:\n',
         _TRA,
     ),
     planting.Mutant(
         'storage', 'the configuration of a finished job is not checked',
-        'experiments/jobs.py',
+        'lab/experiments/jobs.py',
         '  read_config(folder)\n  return True\n', '  return True\n',
-        ('tests/experiments/finished_jobs_test.py',),
+        ('tests/lab/experiments/finished_jobs_test.py',),
     ),
     planting.Mutant(
         'storage', 'worlds stay open when training fails',
-        'experiments/training.py',
+        'lab/experiments/training.py',
         '      stack.callback(lambda: self._batch.close())\n', '',
-        ('tests/experiments/closing_test.py',),
+        ('tests/lab/experiments/closing_test.py',),
     ),
     planting.Mutant(
         'storage', 'a full disk is not explained', _STORAGE,

@@ -35,9 +35,9 @@ from typing import Any, final
 from dm_env import specs as dm_env_specs
 import numpy as np
 
-from realab_suite import agents
 from realab_suite import policies
 from realab_suite.engine import batch_time_steps
+from realab_suite.lab import agents
 from realab_suite.policies import action_sets
 from realab_suite.policies import base as policies_base
 from realab_suite.policies import random_keys

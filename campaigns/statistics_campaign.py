@@ -20,7 +20,7 @@ import numpy as np
 from scipy import stats
 
 from campaigns import figure_lines
-from realab_suite.evaluation import intervals
+from realab_suite.lab.verdicts import intervals
 
 SEEDS = 10
 EPISODES = 5

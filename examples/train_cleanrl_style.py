@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from realab_suite.interop.gymnasium import evaluation
+from realab_suite.doors.gymnasium import evaluation
 
 _WORLD = 'realab/UnlockDoor-near-InstantaneousReward-v3'
 _OPTIONS: dict[str, Any] = {

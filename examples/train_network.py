@@ -21,18 +21,18 @@ import numpy as np
 import tqdm
 
 from realab_suite import worlds
-from realab_suite.agents import action_encoding
-from realab_suite.agents import base
-from realab_suite.agents import features
 from realab_suite.config import validation
 from realab_suite.entities import appearance
 from realab_suite.evaluation import batch_actors
-from realab_suite.evaluation import comparison
 from realab_suite.evaluation import evaluate
-from realab_suite.evaluation import intervals
 from realab_suite.evaluation import results
-from realab_suite.experiments import jobs
 from realab_suite.feedback import specs
+from realab_suite.lab.agents import action_encoding
+from realab_suite.lab.agents import base
+from realab_suite.lab.agents import features
+from realab_suite.lab.experiments import jobs
+from realab_suite.lab.verdicts import comparison
+from realab_suite.lab.verdicts import intervals
 from realab_suite.policies import action_sets
 from realab_suite.policies import network_files
 from realab_suite.policies import network_policies

@@ -21,8 +21,8 @@ import numpy as np
 import stable_baselines3
 from stable_baselines3.common import vec_env
 
-from realab_suite.experiments import gymnasium_report
-from realab_suite.interop.gymnasium import sb3
+from realab_suite.doors.gymnasium import gymnasium_report
+from realab_suite.doors.gymnasium import sb3
 
 _WORLD = 'realab/UnlockDoor-near-InstantaneousReward-v3'
 _OPTIONS: dict[str, Any] = {

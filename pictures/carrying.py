@@ -11,10 +11,10 @@ import numpy as np
 
 from pictures import views
 from realab_suite import suite
-from realab_suite.audit import aiming
 from realab_suite.engine import environment
 from realab_suite.evaluation import evaluate
-from realab_suite.experiments import tracking
+from realab_suite.lab.audit import aiming
+from realab_suite.lab.experiments import tracking
 
 SIZE = (1200, 930)
 """Width and height of the picture, in pixels."""

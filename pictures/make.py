@@ -11,7 +11,7 @@ agents. The same versions and results give the same pictures.
 import pathlib
 
 from realab_suite import errors
-from realab_suite.experiments import requirements
+from realab_suite.lab.experiments import requirements
 from realab_suite.launchers import flags
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers

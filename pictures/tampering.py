@@ -20,9 +20,9 @@ from pictures import views
 from realab_suite import errors
 from realab_suite.engine import environment
 from realab_suite.evaluation import results
-from realab_suite.experiments import replays
-from realab_suite.experiments import sweep_results
-from realab_suite.experiments import tracking
+from realab_suite.lab.experiments import replays
+from realab_suite.lab.experiments import sweep_results
+from realab_suite.lab.experiments import tracking
 
 _PANEL = (420, 430)
 _GAP = 8

@@ -16,7 +16,7 @@ from benchmarks import timing
 from benchmarks import train
 from benchmarks import worlds
 from realab_suite import suite
-from realab_suite.experiments import requirements
+from realab_suite.lab.experiments import requirements
 
 _LINES = [
     (

@@ -31,7 +31,9 @@ _BELOW_SUITE = (
     'evaluation',
 )  # fmt: skip
 _WITH_SUITE = (*_BELOW_SUITE, 'suite')
-_WITH_WORLDS = (*_WITH_SUITE, 'worlds', 'judging')
+# The core imports no wing; `lab` imports the core; `reports` and `doors` import
+# the lab as well, and not each other; `launchers` import everything.
+_CORE = (*_WITH_SUITE, 'worlds', 'testing')
 _MAY_IMPORT = {
     # Functions that are imported when they are asked for.
     '__init__': _WITH_SUITE,
@@ -60,27 +62,25 @@ _MAY_IMPORT = {
     'evaluation': (
         'config', 'entities', 'policies', 'feedback', 'tasks', 'engine',
     ),
+    'suite': _BELOW_SUITE,
+    'worlds': _WITH_SUITE,
+    'testing': (*_WITH_SUITE, 'worlds'),
     # Nothing here may reach the true reward.
-    'agents': (
+    'lab.agents': (
         'config',
         'entities.appearance',
         'feedback.objectives',
         'feedback.specs',
         'policies',
     ),
-    'suite': _BELOW_SUITE,
-    'worlds': _WITH_SUITE,
-    'judging': (*_WITH_SUITE, 'worlds'),
-    'testing': _WITH_SUITE,
-    'audit': _WITH_WORLDS,
-    'interop': _WITH_SUITE,
-    'experiments': (*_WITH_WORLDS, 'audit', 'agents', 'interop'),
-    'reports': (*_WITH_WORLDS, 'audit', 'agents', 'experiments'),
-    'datasets': (*_WITH_WORLDS, 'audit', 'experiments'),
-    'launchers': (
-        *_WITH_WORLDS, 'audit', 'agents', 'interop', 'experiments',
-        'reports', 'datasets',
-    ),
+    'lab': (),
+    'lab.verdicts': _CORE,
+    'lab.attribution': _CORE,
+    'lab.audit': (*_CORE, 'lab.verdicts'),
+    'lab.experiments': (*_CORE, 'lab'),
+    'reports': (*_CORE, 'lab'),
+    'doors': (*_CORE, 'lab'),
+    'launchers': (*_CORE, 'lab', 'reports', 'doors'),
 }  # fmt: skip
 
 # The package imports its functions when they are asked for, and a binding looks
@@ -99,9 +99,15 @@ def _modules() -> list[tuple[str, ast.Module]]:
   return found
 
 
+def _layer(name: str) -> str:
+  """Returns the room of a module; rooms of the lab have rows of their own."""
+  _, *parts = [*name.split('.'), '__init__']
+  return '.'.join(parts[:2]) if parts[0] == 'lab' and parts[2:] else parts[0]
+
+
 def _layers(name: str, tree: ast.Module) -> list[str]:
   """A module imports only what its layer may, by its full name."""
-  layer = [*name.split('.'), '__init__'][1]
+  layer = _layer(name)
   if layer not in _MAY_IMPORT:
     return [f'{name}: no row in _MAY_IMPORT for {layer!r}']
   allowed = (*_FOUNDATION, layer, *_MAY_IMPORT[layer])
@@ -187,27 +193,30 @@ _FORBIDDEN = {
     ],
     'engine.planted': ['from realab_suite.evaluation import ledgers'],
     'evaluation.planted': ['from realab_suite import suite'],
-    'agents.planted': [
+    'lab.agents.planted': [
         'from realab_suite.evaluation import ledgers',
         'from realab_suite.engine import environment',
         'from realab_suite.tasks import base',
         'from realab_suite.feedback import mechanisms',
         'from realab_suite import suite',
     ],
-    'suite': ['from realab_suite import agents'],
-    'worlds': ['from realab_suite.audit import audits'],
-    'audit.planted': [
-        'from realab_suite.agents import base',
-        'from realab_suite.experiments import storage',
+    'suite': ['from realab_suite.lab import agents'],
+    'worlds': ['from realab_suite.lab.audit import audits'],
+    'lab.audit.planted': [
+        'from realab_suite.lab.agents import base',
+        'from realab_suite.lab.experiments import storage',
         'from realab_suite.reports import films',
     ],
-    'interop.planted': ['from realab_suite.experiments import jobs'],
-    'experiments.planted': ['from realab_suite.reports import plots'],
-    'reports.planted': ['from realab_suite.launchers import program'],
-    'datasets.planted': [
-        'from realab_suite import agents',
+    'engine.also_planted': ['from realab_suite.lab.verdicts import stakes'],
+    'lab.experiments.planted': [
         'from realab_suite.reports import plots',
+        'from realab_suite.doors.served import server',
     ],
+    'reports.planted': [
+        'from realab_suite.launchers import program',
+        'from realab_suite.doors.data import export',
+    ],
+    'doors.data.planted': ['from realab_suite.reports import plots'],
     'errors': ['from realab_suite import entities'],
     'archive': ['from realab_suite.engine import snapshots'],
     'unheard_of': ['import numpy'],
@@ -225,11 +234,11 @@ _ALLOWED = {
     ],
     'engine.planted': ['from realab_suite import archive'],
     'suite': ['from realab_suite.evaluation import ledgers'],
-    'audit.planted': ['from realab_suite import worlds'],
-    'agents.planted': ['from realab_suite.config import registry'],
-    'datasets.planted': ['from realab_suite.experiments import replays'],
+    'lab.audit.planted': ['from realab_suite import worlds'],
+    'lab.agents.planted': ['from realab_suite.config import registry'],
+    'doors.data.planted': ['from realab_suite.lab.experiments import replays'],
     'launchers.planted': ['from realab_suite.reports import page'],
-    'experiments.planted': ['from realab_suite.interop.rpc import server'],
+    'doors.served.planted': ['from realab_suite.lab.audit import aiming'],
 }
 
 

@@ -30,7 +30,7 @@ def preserved() -> Iterator[None]:
       registry._TASKS,
   )
   if util.find_spec('jax') is not None:  # It is in the extra `agents`.
-    agents = importlib.import_module('realab_suite.agents')
+    agents = importlib.import_module('realab_suite.lab.agents')
     registries += (
         agents.LEARNERS._entries,
         agents.defences.DEFENCES._entries,

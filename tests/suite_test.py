@@ -18,8 +18,8 @@ import pytest
 import realab_suite
 from realab_suite import errors
 from realab_suite import suite
-from realab_suite.experiments import experiment_specs
 from realab_suite.feedback import specs
+from realab_suite.lab.experiments import experiment_specs
 from realab_suite.tasks import apple_rooms
 from realab_suite.tasks import collect_apples
 from realab_suite.tasks import registry

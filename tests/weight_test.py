@@ -14,6 +14,8 @@ _ROOT = pathlib.Path(__file__).parents[1]
 _PAGE = _ROOT / 'docs' / 'architecture.md'
 _SOURCE = ('.py', '.yaml', '.html', '.j2')
 _PACKAGE = 'realab_suite'
+# Wings whose folders have budgets of their own.
+_WINGS = ('lab', 'doors')
 # Folders beside the package that have budgets.
 _BESIDE = (
     'benchmarks',
@@ -40,7 +42,9 @@ def _budgets() -> dict[str, int]:
 def _room(path: pathlib.Path) -> str:
   if path.parts[0] != _PACKAGE:
     return path.parts[0]
-  return '/'.join(path.parts[:2]) if len(path.parts) > 2 else _PACKAGE
+  *folders, _ = path.parts
+  is_of_wing = len(folders) > 2 and folders[1] in _WINGS
+  return '/'.join(folders[: 3 if is_of_wing else 2])
 
 
 def _weights(root: pathlib.Path) -> dict[str, float]:

@@ -3,7 +3,7 @@
 A child takes milliseconds where a new interpreter takes seconds, so thousands
 of them can be killed:
 
-    with zygote.Zygote('tests.experiments.crashes') as nursery:
+    with zygote.Zygote('tests.lab.experiments.crashes') as nursery:
       pid = nursery.start('run_training', output=folder, ...)
       os.kill(pid, signal.SIGKILL)
       status, said = nursery.wait(pid)

@@ -54,11 +54,11 @@ def main() -> int:
   if not has_film:
     renderers.render_on_demand()
   # Imports dm_control, so a renderer has to be chosen first.
-  from realab_suite.audit import audits
-  from realab_suite.audit import findings
   from realab_suite.evaluation import results
-  from realab_suite.experiments import storage
-  from realab_suite.experiments import training
+  from realab_suite.lab.audit import audits
+  from realab_suite.lab.audit import findings
+  from realab_suite.lab.experiments import storage
+  from realab_suite.lab.experiments import training
 
   flags.load_imports()
   settings = audits.Settings(
@@ -142,7 +142,7 @@ def _write_film(
 ) -> None:
   """Repeats the plan in one world of the comparison, and films it."""
   from realab_suite.evaluation import evaluate
-  from realab_suite.experiments import tracking
+  from realab_suite.lab.experiments import tracking
   from realab_suite.reports import films
 
   with auditor.repeated(found) as (env, policy):

@@ -14,7 +14,7 @@ import sys
 
 from realab_suite import __version__
 from realab_suite.config import messages
-from realab_suite.experiments import requirements
+from realab_suite.lab.experiments import requirements
 from realab_suite.launchers import program
 
 _LAUNCHERS = 'realab_suite.launchers.'

@@ -13,7 +13,7 @@ all of them.
 
 from absl import flags as absl_flags
 
-from realab_suite.experiments import requirements
+from realab_suite.lab.experiments import requirements
 from realab_suite.launchers import flags
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
@@ -45,7 +45,7 @@ def main() -> None:
   if not has_videos:
     renderers.render_on_demand()
   # Imports dm_control, so a renderer has to be chosen first.
-  from realab_suite.experiments import scripted
+  from realab_suite.lab.experiments import scripted
 
   flags.load_imports()
   world = flags.world()

@@ -13,7 +13,7 @@ import platform
 import sys
 from typing import NamedTuple, final
 
-from realab_suite.experiments import requirements
+from realab_suite.lab.experiments import requirements
 from realab_suite.launchers import renderers
 
 # Packages whose versions decide what happens.

@@ -51,7 +51,7 @@ def _write_film() -> None:
   if problem := renderers.why_no_film():
     raise errors.ResultsError(f'no renderer for a film: {problem}')
   from realab_suite.evaluation import evaluate
-  from realab_suite.experiments import tracking
+  from realab_suite.lab.experiments import tracking
   from realab_suite.reports import films
 
   world = '_'.join(flags.domain_and_task())
@@ -90,7 +90,7 @@ def _unused(stem: str) -> str:
 @contextlib.contextmanager
 def _loaded() -> Iterator[tuple[Any, Any, str]]:
   """Yields the environment of the flags, a policy, and its name."""
-  from realab_suite.audit import aiming
+  from realab_suite.lab.audit import aiming
 
   flags.load_imports()
   env = flags.world().load(flags.design(), flags.SEED.value)

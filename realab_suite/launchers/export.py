@@ -30,9 +30,9 @@ def main() -> None:
   output = pathlib.Path(flags.required(flags.OUTPUT, '; name a new folder'))
   renderers.render_on_demand()
   # Imports dm_control, so a renderer has to be chosen first.
-  from realab_suite.datasets import export
-  from realab_suite.datasets import sources
-  from realab_suite.experiments import sweep_results
+  from realab_suite.doors.data import export
+  from realab_suite.doors.data import sources
+  from realab_suite.lab.experiments import sweep_results
 
   export.check(_FORMAT.value, output)
   flags.load_imports()

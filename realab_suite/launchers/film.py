@@ -25,8 +25,8 @@ def main() -> None:
   if problem := renderers.why_no_film():
     raise errors.ResultsError(f'cannot make a film: {problem}')
   # Imports dm_control, so a renderer has to be chosen first.
-  from realab_suite.experiments import replays
-  from realab_suite.experiments import sweep_results
+  from realab_suite.lab.experiments import replays
+  from realab_suite.lab.experiments import sweep_results
   from realab_suite.reports import films
 
   flags.load_imports()

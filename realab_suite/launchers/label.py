@@ -16,7 +16,7 @@ from typing import Any
 from absl import flags as absl_flags
 
 from realab_suite import errors
-from realab_suite import judging
+from realab_suite.lab.verdicts import judging
 from realab_suite.launchers import flags
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
@@ -45,7 +45,7 @@ def main() -> None:
   seeds = flags.seeds()
   renderers.render_on_demand()
   # Imports dm_control, so a renderer has to be chosen first.
-  from realab_suite.datasets import export
+  from realab_suite.doors.data import export
 
   export.check('parquet', output)
   flags.load_imports()
@@ -61,8 +61,8 @@ def main() -> None:
 
 def _of_sweep() -> list[Any]:
   """Returns the sources of the runs of a sweep, if there is one."""
-  from realab_suite.datasets import sources
-  from realab_suite.experiments import sweep_results
+  from realab_suite.doors.data import sources
+  from realab_suite.lab.experiments import sweep_results
 
   if not flags.INPUT.value:
     return []
@@ -78,7 +78,7 @@ def _scripted(seeds: tuple[int, ...]) -> list[Any]:
     SpecError: If a design, a policy or a task does not exist.
   """
   from realab_suite import policies
-  from realab_suite.datasets import sources
+  from realab_suite.doors.data import sources
   from realab_suite.feedback import specs
 
   world = flags.world()

@@ -11,7 +11,7 @@ and learners are left out, so films and paths need the experiment again.
 import pathlib
 
 from realab_suite import errors
-from realab_suite.experiments import requirements
+from realab_suite.lab.experiments import requirements
 from realab_suite.launchers import flags
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
@@ -27,7 +27,7 @@ def main() -> None:
     raise errors.SpecError(f'cannot publish results: {problem}')
   renderers.render_on_demand()
   # Imports dm_control, so a renderer has to be chosen first.
-  from realab_suite.experiments import publishing
+  from realab_suite.lab.experiments import publishing
 
   num_done, num_others = publishing.publish(folder, output)
   program.say(

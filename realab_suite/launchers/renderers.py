@@ -11,7 +11,7 @@ import sys
 
 from realab_suite import _display
 from realab_suite import errors
-from realab_suite.experiments import requirements
+from realab_suite.lab.experiments import requirements
 
 # Enough time to import everything on a slow machine under load.
 _PATIENCE_SECONDS = 300

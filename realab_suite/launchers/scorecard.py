@@ -16,7 +16,7 @@ import pathlib
 from absl import flags as absl_flags
 
 from realab_suite import errors
-from realab_suite.experiments import requirements
+from realab_suite.lab.experiments import requirements
 from realab_suite.launchers import flags
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers

@@ -23,7 +23,7 @@ import os
 from absl import flags as absl_flags
 
 from realab_suite import errors
-from realab_suite.experiments import requirements
+from realab_suite.lab.experiments import requirements
 from realab_suite.launchers import flags
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
@@ -83,7 +83,7 @@ def main() -> None:
   # program at once.
   os.environ['GRPC_ENABLE_FORK_SUPPORT'] = '0'
   # Imports dm_control, so a renderer has to be chosen first.
-  from realab_suite.experiments import served_evaluation
+  from realab_suite.doors.served import served_evaluation
 
   flags.load_imports()
   settings = served_evaluation.Settings(

@@ -9,7 +9,7 @@ divided by the stake is a relative gain; a degenerate stake judges nothing.
 """
 
 from realab_suite import errors
-from realab_suite import judging
+from realab_suite.lab.verdicts import judging
 from realab_suite.launchers import flags
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
@@ -23,8 +23,8 @@ def main() -> None:
   """Prints the stakes of the design that the flags describe."""
   renderers.render_on_demand()
   # Imports dm_control, so a renderer has to be chosen first.
-  from realab_suite.evaluation import stakes
-  from realab_suite.experiments import tables
+  from realab_suite.lab.experiments import tables
+  from realab_suite.lab.verdicts import stakes
 
   flags.load_imports()
   world, design = flags.world(), flags.design()

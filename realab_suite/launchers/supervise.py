@@ -51,12 +51,12 @@ def main() -> None:
   if problem := renderers.why_no_page():
     raise errors.ResultsError(f'cannot show the world: {problem}')
   # Imports dm_control, so a renderer has to be chosen first.
-  from realab_suite.audit import aiming
-  from realab_suite.experiments import storage
-  from realab_suite.experiments import supervised
-  from realab_suite.experiments import supervised_designs
+  from realab_suite.doors.browser import servers
+  from realab_suite.doors.browser import supervised
+  from realab_suite.doors.browser import supervised_designs
   from realab_suite.feedback import specs
-  from realab_suite.interop.browser import servers
+  from realab_suite.lab.audit import aiming
+  from realab_suite.lab.experiments import storage
 
   flags.load_imports()
   world = flags.world()

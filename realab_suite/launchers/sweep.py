@@ -12,7 +12,7 @@ import pathlib
 
 from absl import flags as absl_flags
 
-from realab_suite.experiments import threads
+from realab_suite.lab.experiments import threads
 from realab_suite.launchers import flags
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
@@ -56,13 +56,13 @@ def main() -> None:
   threads.use_one()
   renderers.render_on_demand()
   # Imports numerical libraries, so the number of threads has to be set first.
-  from realab_suite.experiments import engines
-  from realab_suite.experiments import experiment_specs
-  from realab_suite.experiments import jobs
-  from realab_suite.experiments import progress
-  from realab_suite.experiments import scheduler
-  from realab_suite.experiments import storage
-  from realab_suite.experiments import training
+  from realab_suite.lab.experiments import engines
+  from realab_suite.lab.experiments import experiment_specs
+  from realab_suite.lab.experiments import jobs
+  from realab_suite.lab.experiments import progress
+  from realab_suite.lab.experiments import scheduler
+  from realab_suite.lab.experiments import storage
+  from realab_suite.lab.experiments import training
 
   flags.load_imports()
   experiment = experiment_specs.load(name)

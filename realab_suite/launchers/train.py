@@ -11,7 +11,7 @@ import pathlib
 
 from absl import flags as absl_flags
 
-from realab_suite.experiments import threads
+from realab_suite.lab.experiments import threads
 from realab_suite.launchers import flags
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
@@ -40,9 +40,9 @@ def main() -> None:
   # NumPy and JAX read these settings once, when they are imported.
   threads.use_one()
   renderers.render_on_demand()
-  from realab_suite.experiments import experiment_specs
-  from realab_suite.experiments import jobs
-  from realab_suite.experiments import training
+  from realab_suite.lab.experiments import experiment_specs
+  from realab_suite.lab.experiments import jobs
+  from realab_suite.lab.experiments import training
 
   flags.load_imports()
   [job] = jobs.plan(experiment_specs.load(name), [flags.SEED.value], [run])

@@ -34,7 +34,7 @@ _Finite = Annotated[float, pydantic.Field(allow_inf_nan=False)]
 
 @final
 class Feature(validation.Model):
-  """Encoding of one part of an observation, as in `agents/features.py`.
+  """Encoding of one part of an observation, as in `lab/agents/features.py`.
 
   Attributes:
     name: Key in the observation.

@@ -139,7 +139,7 @@ def encode(
     observation: base.Observation,
     lead: tuple[int, ...],
 ) -> np.ndarray:
-  """Returns the features of `agents/features.py`, `(..., features)`.
+  """Returns the features of `lab/agents/features.py`, `(..., features)`.
 
   Args:
     features: Encodings of parts of the observation, in order.

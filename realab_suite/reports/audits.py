@@ -11,10 +11,10 @@ from typing import Any, Literal, final
 import pydantic
 
 from realab_suite import errors
-from realab_suite.audit import findings
 from realab_suite.evaluation import actors
-from realab_suite.evaluation import verdicts
-from realab_suite.experiments import sweep_results
+from realab_suite.lab.audit import findings
+from realab_suite.lab.experiments import sweep_results
+from realab_suite.lab.verdicts import verdicts
 
 # Keys of a design that do not change what can be exploited. What the learner
 # maximises, and what it asks for, is compared apart from its other settings.

@@ -3,10 +3,10 @@
 from collections.abc import Iterable, Mapping
 import math
 
-from realab_suite.evaluation import hacking
-from realab_suite.evaluation import intervals
-from realab_suite.evaluation import verdicts
-from realab_suite.experiments import sweep_results
+from realab_suite.lab.experiments import sweep_results
+from realab_suite.lab.verdicts import hacking
+from realab_suite.lab.verdicts import intervals
+from realab_suite.lab.verdicts import verdicts
 from realab_suite.reports import numbers
 
 

@@ -22,7 +22,7 @@ import tqdm
 from realab_suite import errors
 from realab_suite.engine import environment
 from realab_suite.entities import protocols
-from realab_suite.experiments import tracking
+from realab_suite.lab.experiments import tracking
 
 HEIGHT = 480
 """Height of every view, in pixels."""

@@ -2,11 +2,11 @@
 
 from collections.abc import Mapping
 
-from realab_suite.evaluation import hacking
-from realab_suite.evaluation import intervals
-from realab_suite.evaluation import verdicts
-from realab_suite.experiments import sweep_results
-from realab_suite.experiments import tables
+from realab_suite.lab.experiments import sweep_results
+from realab_suite.lab.experiments import tables
+from realab_suite.lab.verdicts import hacking
+from realab_suite.lab.verdicts import intervals
+from realab_suite.lab.verdicts import verdicts
 from realab_suite.reports import numbers
 
 _Label = verdicts.Label

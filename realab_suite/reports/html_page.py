@@ -12,9 +12,9 @@ import numpy as np
 import yaml
 
 from realab_suite import errors
-from realab_suite.experiments import storage
-from realab_suite.experiments import sweep_results
-from realab_suite.experiments import tables
+from realab_suite.lab.experiments import storage
+from realab_suite.lab.experiments import sweep_results
+from realab_suite.lab.experiments import tables
 from realab_suite.reports import caveats
 from realab_suite.reports import headline
 from realab_suite.reports import numbers

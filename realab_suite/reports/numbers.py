@@ -13,19 +13,19 @@ from typing import Any, NamedTuple, final
 import numpy as np
 import pandas as pd
 
-from realab_suite import judging
-from realab_suite.evaluation import attribution_metrics
-from realab_suite.evaluation import comparison
 from realab_suite.evaluation import gains
-from realab_suite.evaluation import hacking
-from realab_suite.evaluation import intervals
 from realab_suite.evaluation import results
-from realab_suite.evaluation import stakes
-from realab_suite.evaluation import verdicts
-from realab_suite.experiments import jobs
-from realab_suite.experiments import result_tables
-from realab_suite.experiments import sweep_results
-from realab_suite.experiments import tables
+from realab_suite.lab.attribution import attribution_metrics
+from realab_suite.lab.experiments import jobs
+from realab_suite.lab.experiments import result_tables
+from realab_suite.lab.experiments import sweep_results
+from realab_suite.lab.experiments import tables
+from realab_suite.lab.verdicts import comparison
+from realab_suite.lab.verdicts import hacking
+from realab_suite.lab.verdicts import intervals
+from realab_suite.lab.verdicts import judging
+from realab_suite.lab.verdicts import stakes
+from realab_suite.lab.verdicts import verdicts
 from realab_suite.reports import audits
 
 _Rows = Sequence[results.EpisodeResult]

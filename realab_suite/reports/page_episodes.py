@@ -10,8 +10,8 @@ from typing import Any, final
 
 from realab_suite import errors
 from realab_suite.evaluation import results
-from realab_suite.experiments import replays
-from realab_suite.experiments import sweep_results
+from realab_suite.lab.experiments import replays
+from realab_suite.lab.experiments import sweep_results
 from realab_suite.reports import numbers
 from realab_suite.reports import plots
 

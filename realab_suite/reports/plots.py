@@ -24,12 +24,12 @@ from matplotlib import ticker
 import numpy as np
 
 from realab_suite.entities import appearance
-from realab_suite.evaluation import comparison
-from realab_suite.evaluation import hacking
-from realab_suite.evaluation import intervals
-from realab_suite.experiments import replays
-from realab_suite.experiments import sweep_results
-from realab_suite.experiments import tracking
+from realab_suite.lab.experiments import replays
+from realab_suite.lab.experiments import sweep_results
+from realab_suite.lab.experiments import tracking
+from realab_suite.lab.verdicts import comparison
+from realab_suite.lab.verdicts import hacking
+from realab_suite.lab.verdicts import intervals
 from realab_suite.reports import numbers
 
 _Figures = Mapping[str, numbers.Figures]

@@ -4,12 +4,12 @@ from collections.abc import Mapping
 from typing import Any
 
 from realab_suite.evaluation import gains
-from realab_suite.evaluation import hacking
-from realab_suite.evaluation import intervals
-from realab_suite.evaluation import verdicts
-from realab_suite.experiments import result_tables
-from realab_suite.experiments import sweep_results
-from realab_suite.experiments import tables
+from realab_suite.lab.experiments import result_tables
+from realab_suite.lab.experiments import sweep_results
+from realab_suite.lab.experiments import tables
+from realab_suite.lab.verdicts import hacking
+from realab_suite.lab.verdicts import intervals
+from realab_suite.lab.verdicts import verdicts
 from realab_suite.reports import numbers
 
 _Figures = Mapping[str, numbers.Figures]

@@ -9,9 +9,9 @@ from matplotlib import figure
 from matplotlib import patches
 import numpy as np
 
-from realab_suite.evaluation import intervals
-from realab_suite.experiments import storage
-from realab_suite.experiments import tables
+from realab_suite.lab.experiments import storage
+from realab_suite.lab.experiments import tables
+from realab_suite.lab.verdicts import intervals
 from realab_suite.reports import plots
 from realab_suite.reports import scorecards
 

@@ -15,7 +15,6 @@ from typing import Any, NamedTuple, final
 import numpy as np
 
 from realab_suite import errors
-from realab_suite import judging
 from realab_suite import policies
 from realab_suite import suite
 from realab_suite import worlds
@@ -23,17 +22,18 @@ from realab_suite.config import loading
 from realab_suite.config import task_names
 from realab_suite.config import validation
 from realab_suite.evaluation import gains
-from realab_suite.evaluation import hacking
-from realab_suite.evaluation import intervals
 from realab_suite.evaluation import results
-from realab_suite.evaluation import scores
-from realab_suite.evaluation import stakes
-from realab_suite.evaluation import verdicts
-from realab_suite.experiments import experiment_specs
-from realab_suite.experiments import result_tables
-from realab_suite.experiments import storage
-from realab_suite.experiments import sweep_results
 from realab_suite.feedback import specs
+from realab_suite.lab.experiments import experiment_specs
+from realab_suite.lab.experiments import result_tables
+from realab_suite.lab.experiments import storage
+from realab_suite.lab.experiments import sweep_results
+from realab_suite.lab.verdicts import hacking
+from realab_suite.lab.verdicts import intervals
+from realab_suite.lab.verdicts import judging
+from realab_suite.lab.verdicts import scores
+from realab_suite.lab.verdicts import stakes
+from realab_suite.lab.verdicts import verdicts
 from realab_suite.reports import numbers
 
 OWN_DESIGN = 'own design'

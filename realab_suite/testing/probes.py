@@ -50,7 +50,7 @@ An imitator works in `push_down`: after a push it reads "wait" for "work". In
 pushing then confirms itself, and there is no answer on paper.
 
     import functools
-    from realab_suite import agents
+    from realab_suite.lab import agents
     from realab_suite.testing import probes
 
     learner = {'kind': 'policy_gradient', 'reward': 'reward', **probes.SMALL}

@@ -13,19 +13,19 @@ import pytest
 from realab_suite import errors
 from realab_suite import policies
 from realab_suite import suite
-from realab_suite.audit import aiming
-from realab_suite.audit import attacks
-from realab_suite.datasets import recording
-from realab_suite.datasets import truth
+from realab_suite.doors.data import recording
+from realab_suite.doors.data import truth
 from realab_suite.entities import registers
-from realab_suite.evaluation import attribution
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import ledgers
 from realab_suite.feedback import register_kinds
 from realab_suite.feedback import specs
+from realab_suite.lab.attribution import attribution
+from realab_suite.lab.audit import aiming
+from realab_suite.lab.audit import attacks
 from tests.authors import abacus
-from tests.datasets import made
+from tests.doors.data import made
 
 _PORTS = ['seen_left', 'seen_right', 'told_left', 'told_right']
 _TOLD = _PORTS[2:]
@@ -355,7 +355,7 @@ def test_an_audit_attacks_all_blocks_once():
 
 def test_gymnasium_has_a_number_for_each_port():
   pytest.importorskip('gymnasium')
-  from realab_suite.interop.gymnasium import single
+  from realab_suite.doors.gymnasium import single
 
   env = single.RealabEnv(_load(), reward_register='told_right')
   observation, _ = env.reset(seed=1)
@@ -378,7 +378,7 @@ def test_a_dataset_has_rows_for_each_port():
 
 def test_a_report_has_the_figures_of_each_port(tmp_path, monkeypatch):
   pytest.importorskip('jinja2')
-  from tests.experiments import fake_sweep
+  from tests.lab.experiments import fake_sweep
   from tests.reports import pages
 
   monkeypatch.chdir(tmp_path)

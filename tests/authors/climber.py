@@ -8,9 +8,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from realab_suite import agents
-from realab_suite.agents import base
 from realab_suite.feedback import objectives
+from realab_suite.lab import agents
+from realab_suite.lab.agents import base
 
 KIND = 'climber'
 

@@ -13,14 +13,14 @@ import pytest
 pytest.importorskip('jax', reason='jax is in the extra `agents`')
 pytest.importorskip('equinox', reason='equinox is in the extra `agents`')
 
-from realab_suite import agents
 from realab_suite import testing
 from realab_suite.evaluation import results
-from realab_suite.experiments import experiment_specs
-from realab_suite.experiments import jobs
-from realab_suite.experiments import training
+from realab_suite.lab import agents
+from realab_suite.lab.experiments import experiment_specs
+from realab_suite.lab.experiments import jobs
+from realab_suite.lab.experiments import training
 from tests import registries
-from tests.experiments import small
+from tests.lab.experiments import small
 
 _AUTHORS = 'tests.authors.climber'
 _LEARNER = {'kind': 'climber', 'lures': 'reward', 'daring': 0.5}

@@ -15,7 +15,7 @@ import pytest
 from realab_suite import errors
 from realab_suite import suite
 from realab_suite import testing
-from realab_suite.evaluation import attribution
+from realab_suite.lab.attribution import attribution
 from tests import registries
 from tests.evaluation import staged
 

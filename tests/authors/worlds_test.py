@@ -14,17 +14,18 @@ from realab_suite import errors
 from realab_suite import policies
 from realab_suite import testing
 from realab_suite import worlds as named
-from realab_suite.audit import audits
-from realab_suite.datasets import export
-from realab_suite.datasets import sources
+from realab_suite.doors.data import export
+from realab_suite.doors.data import sources
+from realab_suite.doors.gymnasium import single
 from realab_suite.engine import batch_environment
 from realab_suite.entities import arenas
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
-from realab_suite.evaluation import stakes
-from realab_suite.experiments import scripted
 from realab_suite.feedback import specs
-from realab_suite.interop.gymnasium import single
+from realab_suite.lab.audit import audits
+from realab_suite.lab.experiments import scripted
+from realab_suite.lab.verdicts import judging
+from realab_suite.lab.verdicts import stakes
 from realab_suite.tasks import collect_apples
 from realab_suite.tasks import rooms
 from realab_suite.tasks import unlock_door
@@ -224,7 +225,7 @@ def test_its_solver_and_controls_are_judged(
     worlds: Any, world: named.World, fields: dict[str, Any]
 ):
   design = specs.load(worlds.design(**fields))
-  stake = named.stakes_of(world, design)
+  stake = judging.stakes_of(world, design)
   assert stake is not None
   assert stake.parts['return'].estimate > 1
   assert world.scripted == ('crab_walker', 'pushing_saboteur', 'random')

@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from realab_suite.experiments import experiment_specs
 from realab_suite.feedback import specs
+from realab_suite.lab.experiments import experiment_specs
 from tests import memory
 from tests import work
 from tests.config import hazards

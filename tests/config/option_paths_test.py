@@ -12,8 +12,8 @@ import pytest
 from realab_suite import policies
 from realab_suite import suite
 from realab_suite.config import messages
-from realab_suite.experiments import experiment_specs
 from realab_suite.feedback import specs
+from realab_suite.lab.experiments import experiment_specs
 from tests.config import file_readers
 from tests.config import off_limits
 from tests.config import refusals

@@ -8,8 +8,8 @@ import pytest
 
 from realab_suite import suite
 from realab_suite.config import loading
-from realab_suite.experiments import experiment_specs
 from realab_suite.feedback import specs
+from realab_suite.lab.experiments import experiment_specs
 from tests.config import refusals
 from tests.feedback import designs
 

@@ -7,7 +7,7 @@ import tempfile
 
 import pytest
 
-from realab_suite.experiments import experiment_specs
+from realab_suite.lab.experiments import experiment_specs
 from tests.docs import pages
 from tests.docs import workshop
 

@@ -9,9 +9,9 @@ import dataclasses
 import os
 from typing import Any
 
-from realab_suite.audit import audits
-from realab_suite.evaluation import stakes
-from realab_suite.experiments import experiment_specs
+from realab_suite.lab.audit import audits
+from realab_suite.lab.experiments import experiment_specs
+from realab_suite.lab.verdicts import stakes
 from realab_suite.launchers import flags
 from realab_suite.reports import films
 from realab_suite.reports import page_episodes

@@ -164,9 +164,9 @@ def _serve(folder: str) -> NoReturn:
 def _prepare(folder: str) -> None:
   for name in (
       'jax', 'optax', 'equinox', 'matplotlib.pyplot', 'imageio', 'av', 'grpc',
-      'gymnasium', 'realab_suite.agents', 'realab_suite.suite',
-      'realab_suite.experiments.training', 'realab_suite.reports.html_page',
-      'realab_suite.experiments.served_evaluation',
+      'gymnasium', 'realab_suite.lab.agents', 'realab_suite.suite',
+      'realab_suite.lab.experiments.training', 'realab_suite.reports.html_page',
+      'realab_suite.doors.served.served_evaluation',
   ):  # fmt: skip
     with contextlib.suppress(ImportError):  # Packages of extras.
       importlib.import_module(name)
@@ -293,7 +293,7 @@ def _python(arguments: list[str], notes: int) -> None:
 
 def _launch(main: Callable[[], Any], notes: int) -> NoReturn:
   """Runs a launcher, up to where it listens if it serves."""
-  from realab_suite.experiments import requirements
+  from realab_suite.lab.experiments import requirements
   from realab_suite.launchers import program
 
   arguments = sys.argv[:]

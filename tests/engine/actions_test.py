@@ -10,9 +10,9 @@ import pytest
 
 from realab_suite import errors
 from realab_suite import suite
+from realab_suite.doors.served import served_world
 from realab_suite.engine import action_codec
 from realab_suite.engine import agent_view
-from realab_suite.interop.rpc import served_world
 from realab_suite.policies import action_sets
 from tests.engine import helpers
 

@@ -11,18 +11,18 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 
-from realab_suite import judging
 from realab_suite import policies
-from realab_suite.audit import aiming
 from realab_suite.engine import events
 from realab_suite.entities import registers
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import ledgers
-from realab_suite.evaluation import verdicts
 from realab_suite.feedback import objectives
 from realab_suite.feedback import providers
 from realab_suite.feedback import specs
+from realab_suite.lab.audit import aiming
+from realab_suite.lab.verdicts import judging
+from realab_suite.lab.verdicts import verdicts
 from tests.engine import helpers
 from tests.evaluation import judged
 from tests.feedback import tampered

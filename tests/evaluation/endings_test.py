@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from realab_suite import suite
-from realab_suite.audit import aiming
 from realab_suite.engine import agent_view
 from realab_suite.engine import environment
 from realab_suite.engine import events
@@ -18,9 +17,10 @@ from realab_suite.evaluation import endings
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import monitors
 from realab_suite.evaluation import results
-from realab_suite.evaluation import stakes
-from realab_suite.evaluation import verdicts
-from realab_suite.experiments import result_tables
+from realab_suite.lab.audit import aiming
+from realab_suite.lab.experiments import result_tables
+from realab_suite.lab.verdicts import stakes
+from realab_suite.lab.verdicts import verdicts
 from tests.engine import helpers
 from tests.evaluation import rooms
 from tests.evaluation import rows

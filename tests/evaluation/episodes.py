@@ -5,7 +5,7 @@ import dataclasses
 from typing import Any
 
 from realab_suite.evaluation import gains
-from realab_suite.evaluation import stakes
+from realab_suite.lab.verdicts import stakes
 
 NAN = float('nan')
 SEEDS = range(10)

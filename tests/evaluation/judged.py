@@ -11,20 +11,20 @@ from typing import Any, NamedTuple, final
 import numpy as np
 import pytest
 
-from realab_suite import judging
 from realab_suite import policies
 from realab_suite import worlds
-from realab_suite.audit import aiming
 from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import gains
-from realab_suite.evaluation import obstacles
 from realab_suite.evaluation import results
-from realab_suite.evaluation import stakes
-from realab_suite.experiments import result_tables
 from realab_suite.feedback import specs
+from realab_suite.lab.audit import aiming
+from realab_suite.lab.experiments import result_tables
+from realab_suite.lab.verdicts import judging
+from realab_suite.lab.verdicts import obstacles
+from realab_suite.lab.verdicts import stakes
 from tests.evaluation import rows
 
 SOLVER = 'apple_seeker'

@@ -8,13 +8,13 @@ from realab_suite import suite
 from realab_suite.engine import snapshots
 from realab_suite.evaluation import ledgers
 from realab_suite.evaluation import monitors
-from realab_suite.experiments import jobs
-from realab_suite.experiments import replays
-from realab_suite.experiments import scheduler
-from realab_suite.experiments import sweep_results
-from realab_suite.experiments import training
-from tests.experiments import fake_learner
-from tests.experiments import fake_sweep
+from realab_suite.lab.experiments import jobs
+from realab_suite.lab.experiments import replays
+from realab_suite.lab.experiments import scheduler
+from realab_suite.lab.experiments import sweep_results
+from realab_suite.lab.experiments import training
+from tests.lab.experiments import fake_learner
+from tests.lab.experiments import fake_sweep
 
 _NUM_ENVS = 2
 

@@ -21,11 +21,11 @@ from realab_suite import errors
 from realab_suite import policies
 from realab_suite import suite
 from realab_suite.engine import events
-from realab_suite.evaluation import comparison
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import results
-from realab_suite.evaluation import stakes
+from realab_suite.lab.verdicts import comparison
+from realab_suite.lab.verdicts import stakes
 from tests import examples
 from tests.evaluation import rows
 

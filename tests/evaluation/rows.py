@@ -6,7 +6,7 @@ from realab_suite.engine import events
 from realab_suite.evaluation import episode_figures
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import results
-from realab_suite.evaluation import stakes
+from realab_suite.lab.verdicts import stakes
 
 READ = episode_figures.RegisterFigures(
     corruption=1 / 30, units=1 / 3, own=0.01, inherited=0.02, obstruction=0.05,

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from realab_suite.entities import registers
-from realab_suite.evaluation import hacking
-from realab_suite.evaluation import stakes
-from realab_suite.evaluation import verdicts
 from realab_suite.feedback import specs
+from realab_suite.lab.verdicts import hacking
+from realab_suite.lab.verdicts import stakes
+from realab_suite.lab.verdicts import verdicts
 from tests import examples
 from tests.evaluation import streams
 

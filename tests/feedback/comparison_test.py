@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from realab_suite import errors
-from realab_suite import judging
 from realab_suite import policies
 from realab_suite import suite
 from realab_suite import worlds
 from realab_suite.evaluation import evaluate
 from realab_suite.feedback import providers
 from realab_suite.feedback import specs
+from realab_suite.lab.verdicts import judging
 
 _SILENT = None
 

@@ -7,9 +7,9 @@ from typing import Any, Literal, final
 import pytest
 
 from realab_suite import suite
-from realab_suite.experiments import experiment_specs
 from realab_suite.feedback import providers
 from realab_suite.feedback import specs
+from realab_suite.lab.experiments import experiment_specs
 from tests.config import refusals
 from tests.engine import helpers
 from tests.feedback import designs

@@ -17,8 +17,8 @@ import yaml
 
 from realab_suite import errors
 from realab_suite import suite
-from realab_suite.experiments import experiment_specs
 from realab_suite.feedback import specs
+from realab_suite.lab.experiments import experiment_specs
 from tests import examples
 from tests.engine import helpers
 

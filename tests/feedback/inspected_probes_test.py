@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from realab_suite import agents
 from realab_suite.engine import events
 from realab_suite.evaluation import monitors
 from realab_suite.evaluation import results
 from realab_suite.feedback import specs
+from realab_suite.lab import agents
 from realab_suite.testing import probes
 
 _STEPS = probes.NUM_STEPS

@@ -3,10 +3,10 @@
 import pytest
 
 from campaigns import snapshot_campaign
-from realab_suite import agents
 from realab_suite import suite
-from realab_suite.experiments import experiment_specs
 from realab_suite.feedback import specs
+from realab_suite.lab import agents
+from realab_suite.lab.experiments import experiment_specs
 from tests.engine import helpers
 from tests.engine import identity
 

@@ -9,10 +9,10 @@ import copy
 import pytest
 
 from realab_suite import suite
-from realab_suite.audit import aiming
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import ledgers
 from realab_suite.feedback import specs
+from realab_suite.lab.audit import aiming
 
 
 def _renamed(design, old, new):

@@ -19,9 +19,9 @@ from realab_suite.entities import rays
 from realab_suite.entities import registers
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import evaluate
-from realab_suite.evaluation import obstacles
 from realab_suite.feedback import providers
 from realab_suite.feedback import specs
+from realab_suite.lab.verdicts import obstacles
 from realab_suite.policies import action_sets
 from realab_suite.tasks import collect_apples
 from realab_suite.testing import providers as contract

@@ -5,9 +5,9 @@ import shlex
 
 import pytest
 
-from realab_suite.audit import findings
+from realab_suite.lab.audit import findings
 from realab_suite.launchers import audit
-from tests.experiments import small
+from tests.lab.experiments import small
 from tests.launchers import in_process
 
 

@@ -14,9 +14,9 @@ import pytest
 
 from realab_suite import _display
 from realab_suite import errors
-from realab_suite.experiments import experiment_specs
-from realab_suite.experiments import requirements
-from realab_suite.experiments import scripted
+from realab_suite.lab.experiments import experiment_specs
+from realab_suite.lab.experiments import requirements
+from realab_suite.lab.experiments import scripted
 from realab_suite.launchers import compare
 from realab_suite.launchers import explore
 from realab_suite.launchers import film
@@ -25,7 +25,7 @@ from realab_suite.launchers import renderers
 from realab_suite.launchers import sweep  # noqa: F401 - defines --workers.
 from realab_suite.launchers import train  # noqa: F401 - defines --parent.
 from tests import patience
-from tests.experiments import small
+from tests.lab.experiments import small
 from tests.launchers import in_process
 
 _ROOT = pathlib.Path(__file__).parents[2]

@@ -6,14 +6,14 @@ pytest.importorskip('pyarrow')
 
 from pyarrow import parquet
 
-from realab_suite.experiments import jobs
-from realab_suite.experiments import scheduler
-from realab_suite.experiments import training
+from realab_suite.lab.experiments import jobs
+from realab_suite.lab.experiments import scheduler
+from realab_suite.lab.experiments import training
 from realab_suite.launchers import export
 from realab_suite.launchers import label
-from tests.experiments import fake_learner
-from tests.experiments import fake_sweep
-from tests.experiments import small
+from tests.lab.experiments import fake_learner
+from tests.lab.experiments import fake_sweep
+from tests.lab.experiments import small
 from tests.launchers import in_process
 
 

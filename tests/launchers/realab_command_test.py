@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 
 import realab_suite
-from realab_suite.experiments import experiment_specs
-from realab_suite.experiments import requirements
+from realab_suite.lab.experiments import experiment_specs
+from realab_suite.lab.experiments import requirements
 from realab_suite.launchers import command
 from realab_suite.launchers import doctor
 from realab_suite.launchers import renderers

@@ -2,11 +2,11 @@
 
 import pytest
 
-from realab_suite import judging
 from realab_suite import worlds
 from realab_suite.feedback import specs
+from realab_suite.lab.verdicts import judging
 from realab_suite.launchers import stake
-from tests.experiments import small
+from tests.lab.experiments import small
 from tests.launchers import in_process
 
 _SHORT = ('--task=near', '--max_steps=15', '--set=dof=planar')

@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from realab_suite import judging
 from realab_suite.evaluation import monitors
 from realab_suite.evaluation import traces
-from realab_suite.experiments import experiment_specs
-from realab_suite.experiments import jobs
-from realab_suite.experiments import training
+from realab_suite.lab.experiments import experiment_specs
+from realab_suite.lab.experiments import jobs
+from realab_suite.lab.experiments import training
+from realab_suite.lab.verdicts import judging
 from realab_suite.tasks import base
-from tests.experiments import fake_learner
+from tests.lab.experiments import fake_learner
 from tests.leaks import secrets
 
 _NUM_ENVS = 2

@@ -18,8 +18,8 @@ from realab_suite.engine import placement
 from realab_suite.engine import seeding
 from realab_suite.entities import avatars
 from realab_suite.entities import registers
-from realab_suite.experiments import training
 from realab_suite.feedback import mechanisms
+from realab_suite.lab.experiments import training
 from realab_suite.tasks import base
 from realab_suite.tasks import collect_apples
 from tests.leaks import files

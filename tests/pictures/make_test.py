@@ -14,11 +14,11 @@ from pictures import tampering
 from pictures import views
 from realab_suite import errors
 from realab_suite import suite
-from realab_suite.experiments import jobs
-from realab_suite.experiments import scheduler
-from realab_suite.experiments import training
-from tests.experiments import fake_learner
-from tests.experiments import fake_sweep
+from realab_suite.lab.experiments import jobs
+from realab_suite.lab.experiments import scheduler
+from realab_suite.lab.experiments import training
+from tests.lab.experiments import fake_learner
+from tests.lab.experiments import fake_sweep
 from tests.launchers import in_process
 from tests.reports import pages
 

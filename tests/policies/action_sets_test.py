@@ -4,13 +4,13 @@ import dm_env
 import numpy as np
 import pytest
 
-from realab_suite import agents
 from realab_suite import errors
 from realab_suite import policies
 from realab_suite import suite
 from realab_suite.engine import batch_environment
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import batch_actors
+from realab_suite.lab import agents
 from realab_suite.policies import action_sets
 from realab_suite.policies import macros
 from realab_suite.tasks import collect_apples

@@ -5,8 +5,8 @@ import pytest
 
 from realab_suite import policies
 from realab_suite import suite
-from realab_suite.audit import aiming
-from realab_suite.audit import episodes
+from realab_suite.lab.audit import aiming
+from realab_suite.lab.audit import episodes
 from realab_suite.policies import macros
 
 _KEY = np.zeros(2, np.uint64)

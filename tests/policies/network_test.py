@@ -145,8 +145,8 @@ def test_outputs_do_not_depend_on_the_other_worlds_of_a_batch(
 
 def test_features_and_outputs_equal_those_of_the_learners(shipped, views):
   pytest.importorskip('equinox')
-  from realab_suite.agents import features
-  from realab_suite.agents import networks
+  from realab_suite.lab.agents import features
+  from realab_suite.lab.agents import networks
 
   batch = suite.load_batch('unlock_door', 'near', num_envs=1, design='none')
   spec = batch.observation_spec()

@@ -6,11 +6,11 @@ import types
 import pytest
 
 from realab_suite import errors
-from realab_suite.audit import findings
-from realab_suite.evaluation import verdicts
 from realab_suite.feedback import specs
+from realab_suite.lab.audit import findings
+from realab_suite.lab.verdicts import verdicts
 from realab_suite.reports import audits
-from tests.audit import designs
+from tests.lab.audit import designs
 
 _WORLD = {
     'domain': 'unlock_door', 'task': 'near', 'max_steps': 250,

@@ -2,10 +2,10 @@
 
 import csv
 
-from realab_suite.evaluation import verdicts
-from realab_suite.experiments import replays
-from realab_suite.experiments import sweep_results
-from realab_suite.experiments import training
+from realab_suite.lab.experiments import replays
+from realab_suite.lab.experiments import sweep_results
+from realab_suite.lab.experiments import training
+from realab_suite.lab.verdicts import verdicts
 from realab_suite.reports import caveats
 from realab_suite.reports import html_page
 from realab_suite.reports import numbers

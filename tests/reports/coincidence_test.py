@@ -2,17 +2,17 @@
 
 import pytest
 
-from realab_suite import judging
 from realab_suite import worlds
-from realab_suite.evaluation import stakes
-from realab_suite.evaluation import verdicts
-from realab_suite.experiments import result_tables
-from realab_suite.experiments import sweep_results
 from realab_suite.feedback import specs
+from realab_suite.lab.experiments import result_tables
+from realab_suite.lab.experiments import sweep_results
+from realab_suite.lab.verdicts import judging
+from realab_suite.lab.verdicts import stakes
+from realab_suite.lab.verdicts import verdicts
 from realab_suite.reports import headline
 from realab_suite.reports import numbers
 from realab_suite.reports import scorecards
-from tests.experiments import fake_sweep
+from tests.lab.experiments import fake_sweep
 from tests.reports import scorecard_rows
 
 _Label = verdicts.Label

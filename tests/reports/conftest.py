@@ -6,8 +6,8 @@ import pytest
 
 from realab_suite import suite
 from realab_suite.reports import html_page
-from tests.experiments import fake_sweep
-from tests.experiments import small
+from tests.lab.experiments import fake_sweep
+from tests.lab.experiments import small
 from tests.reports import pages
 
 

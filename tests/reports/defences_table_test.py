@@ -7,9 +7,9 @@ pytest.importorskip('optax', reason='optax is in the extra `agents`')
 pytest.importorskip('equinox', reason='equinox is in the extra `agents`')
 
 from campaigns import defences_table
-from realab_suite.experiments import sweep_results
+from realab_suite.lab.experiments import sweep_results
 from realab_suite.reports import numbers
-from tests.experiments import fake_sweep
+from tests.lab.experiments import fake_sweep
 
 _PLAIN = {'design': 'instantaneous_reward', 'overrides': ['dof=planar']}
 _GATED = {

@@ -6,14 +6,14 @@ import json
 import pytest
 
 from realab_suite import errors
-from realab_suite.evaluation import verdicts
-from realab_suite.experiments import scheduler
-from realab_suite.experiments import sweep_results
-from realab_suite.experiments import training
+from realab_suite.lab.experiments import scheduler
+from realab_suite.lab.experiments import sweep_results
+from realab_suite.lab.experiments import training
+from realab_suite.lab.verdicts import verdicts
 from realab_suite.reports import headline
 from realab_suite.reports import html_page
 from realab_suite.reports import numbers
-from tests.experiments import fake_sweep
+from tests.lab.experiments import fake_sweep
 from tests.reports import pages
 
 _Label = verdicts.Label

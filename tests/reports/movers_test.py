@@ -4,9 +4,9 @@ import csv
 
 import pytest
 
-from realab_suite.evaluation import attribution_metrics
 from realab_suite.evaluation import results
-from realab_suite.experiments import training
+from realab_suite.lab.attribution import attribution_metrics
+from realab_suite.lab.experiments import training
 from realab_suite.reports import html_page
 from tests.reports import pages
 

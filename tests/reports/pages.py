@@ -7,9 +7,9 @@ import re
 import pytest
 
 from realab_suite.evaluation import results
-from realab_suite.experiments import scheduler
-from realab_suite.experiments import storage
-from realab_suite.experiments import training
+from realab_suite.lab.experiments import scheduler
+from realab_suite.lab.experiments import storage
+from realab_suite.lab.experiments import training
 from realab_suite.reports import html_page
 from realab_suite.reports import plots
 

@@ -13,11 +13,11 @@ from realab_suite import errors
 from realab_suite import policies
 from realab_suite import suite
 from realab_suite.evaluation import evaluate
-from realab_suite.experiments import scripted
-from realab_suite.experiments import tracking
+from realab_suite.lab.experiments import scripted
+from realab_suite.lab.experiments import tracking
 from realab_suite.reports import films
 from realab_suite.reports import plots
-from tests.experiments import small
+from tests.lab.experiments import small
 
 
 def _load(design='instantaneous_reward'):

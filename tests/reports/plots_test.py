@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from realab_suite.experiments import sweep_results
+from realab_suite.lab.experiments import sweep_results
 from realab_suite.reports import numbers
 from realab_suite.reports import plots
-from tests.experiments import fake_sweep
+from tests.lab.experiments import fake_sweep
 
 
 @pytest.fixture(name='canvases')

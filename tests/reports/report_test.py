@@ -12,19 +12,19 @@ import pytest
 from realab_suite import errors
 from realab_suite import suite
 from realab_suite import worlds
-from realab_suite.evaluation import comparison
 from realab_suite.evaluation import results
-from realab_suite.experiments import experiment_specs
-from realab_suite.experiments import jobs
-from realab_suite.experiments import replays
-from realab_suite.experiments import scheduler
-from realab_suite.experiments import storage
-from realab_suite.experiments import sweep_results
-from realab_suite.experiments import tables
-from realab_suite.experiments import training
+from realab_suite.lab.experiments import experiment_specs
+from realab_suite.lab.experiments import jobs
+from realab_suite.lab.experiments import replays
+from realab_suite.lab.experiments import scheduler
+from realab_suite.lab.experiments import storage
+from realab_suite.lab.experiments import sweep_results
+from realab_suite.lab.experiments import tables
+from realab_suite.lab.experiments import training
+from realab_suite.lab.verdicts import comparison
 from realab_suite.reports import html_page
 from tests import patience
-from tests.experiments import fake_sweep
+from tests.lab.experiments import fake_sweep
 from tests.reports import pages
 
 _ROOT = pathlib.Path(__file__).parents[2]

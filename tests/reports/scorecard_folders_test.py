@@ -5,11 +5,11 @@ import re
 import pytest
 
 from realab_suite import errors
-from realab_suite import judging
+from realab_suite.lab.verdicts import judging
 from realab_suite.launchers import scorecard
 from realab_suite.reports import scorecard_pages
 from realab_suite.reports import scorecards
-from tests.experiments import fake_sweep
+from tests.lab.experiments import fake_sweep
 from tests.launchers import in_process
 from tests.reports import scorecard_rows
 

@@ -8,8 +8,8 @@ from realab_suite import suite
 from realab_suite.evaluation import episode_figures
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import results
-from realab_suite.evaluation import stakes
 from realab_suite.feedback import specs
+from realab_suite.lab.verdicts import stakes
 
 _PART = stakes.Stake(estimate=10, low=9, high=11, than='random')
 _STAKE = stakes.Stakes(key='0', parts={'return': _PART})

@@ -5,16 +5,16 @@ import csv
 import pytest
 
 from realab_suite import errors
-from realab_suite import judging
 from realab_suite import suite
-from realab_suite.evaluation import verdicts
-from realab_suite.experiments import experiment_specs
-from realab_suite.experiments import publishing
+from realab_suite.lab.experiments import experiment_specs
+from realab_suite.lab.experiments import publishing
+from realab_suite.lab.verdicts import judging
+from realab_suite.lab.verdicts import verdicts
 from realab_suite.launchers import scorecard
 from realab_suite.reports import plots
 from realab_suite.reports import scorecard_pages
 from realab_suite.reports import scorecards
-from tests.experiments import fake_sweep
+from tests.lab.experiments import fake_sweep
 from tests.launchers import in_process
 from tests.reports import scorecard_rows
 

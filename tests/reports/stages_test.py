@@ -6,16 +6,16 @@ import shutil
 import pytest
 
 from realab_suite import errors
-from realab_suite.evaluation import comparison
 from realab_suite.evaluation import results
-from realab_suite.experiments import experiment_specs
-from realab_suite.experiments import publishing
-from realab_suite.experiments import sweep_results
-from realab_suite.experiments import tables
-from realab_suite.experiments import training
+from realab_suite.lab.experiments import experiment_specs
+from realab_suite.lab.experiments import publishing
+from realab_suite.lab.experiments import sweep_results
+from realab_suite.lab.experiments import tables
+from realab_suite.lab.experiments import training
+from realab_suite.lab.verdicts import comparison
 from realab_suite.reports import html_page
 from realab_suite.reports import plots
-from tests.experiments import fake_sweep
+from tests.lab.experiments import fake_sweep
 from tests.reports import pages
 
 _TITLE = 'Training tasks and the judged task'

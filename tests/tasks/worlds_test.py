@@ -13,9 +13,9 @@ import realab_suite as realab
 from realab_suite import errors
 from realab_suite import suite
 from realab_suite import testing
-from realab_suite.audit import aiming
-from realab_suite.evaluation import obstacles
 from realab_suite.feedback import specs
+from realab_suite.lab.audit import aiming
+from realab_suite.lab.verdicts import obstacles
 from realab_suite.tasks import registry
 from tests.engine import helpers
 

@@ -1,0 +1,336 @@
+"""Episodes in which a person provides the feedback, in a browser.
+
+The page shows the view of the agent and has one button for each answer. Answers
+are logged as a dataset, which the source `recorded` replays.
+"""
+
+from collections import deque
+from collections.abc import Callable, Collection
+import json
+import pathlib
+import time
+from typing import Any, final
+
+import numpy as np
+
+from realab_suite import errors
+from realab_suite import worlds
+from realab_suite.doors.browser import servers
+from realab_suite.doors.browser import views
+from realab_suite.engine import environment
+from realab_suite.evaluation import actors
+from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import results
+from realab_suite.feedback.providers import answer_sources
+from realab_suite.feedback.providers import person
+from realab_suite.lab.experiments import evaluations
+from realab_suite.lab.experiments import storage
+from realab_suite.lab.experiments import tracking
+
+ANSWERS = 'answers.jsonl'
+"""Name of the file of answers."""
+
+# Longest wait for a message, in seconds.
+_PATIENCE = 0.2
+# Upper bound of the times of a page, in ms since 1970.
+_LATEST = 1e15
+# Numbers of the pictures in the page: the view, and the earlier clip.
+_VIEW, _FIRST_CLIP = 0, 1
+_RUN = 'supervised'
+_NO_CONTROL = (
+    'the person would have to answer again for a control and for stakes'
+)
+
+# Pictures of the earlier and of the later clip, or nothing.
+_Clips = tuple[list[bytes], ...]
+
+
+@final
+class Supervision:
+  """Shows episodes in the page, asks for answers and logs them."""
+
+  def __init__(
+      self,
+      env: environment.Environment,
+      server: servers.PageServer,
+      folder: pathlib.Path,
+      rate: float,
+  ) -> None:
+    """Connects the persons of a design to a page.
+
+    Args:
+      env: Environment whose design has providers of kind `person` with the
+        source `live`.
+      server: Server of the page `supervise`.
+      folder: Folder of the answers.
+      rate: Largest number of control steps per second.
+
+    Raises:
+      SpecError: If the design has no such provider, or two that ask the same.
+    """
+    self._env, self._server = env, server
+    self._folder = folder
+    self._path = folder / ANSWERS
+    self._period = 1.0 / rate
+    design = env.mechanism.design
+    self._asks: list[str] = []
+    clip = 1
+    for provider in design.providers:
+      if isinstance(provider, person.Person):
+        source = provider.source
+        if isinstance(source, answer_sources.Live):
+          source.connect(self._ask)
+          self._asks.append(provider.asks)
+          if provider.asks == answer_sources.COMPARISON:
+            clip = provider.clip * provider.every
+    if not self._asks:
+      raise errors.SpecError(
+          f'design {design.name!r}: no provider of kind person with the live'
+          ' source of answers; allowed is a design with one'
+      )
+    if len(set(self._asks)) < len(self._asks):
+      raise errors.SpecError(
+          f'design {design.name!r}: two providers with the live source ask for'
+          f' the same: {self._asks}; allowed is one for each question'
+      )
+    self._view = views.first_person(env)
+    # Pictures of the control steps of both clips.
+    self._pictures: deque[bytes] = deque(maxlen=2 * clip)
+    self._question: tuple[dict[str, Any], _Clips] | None = None
+    self._is_running = False
+    self._deadline = 0.0
+    self._given: dict[str, tuple[float, float]] = {}
+    self._written: list[float] = []
+    self._log: list[dict[str, Any]] = []
+    self._track: tracking.Track | None = None
+    self.delays: list[float] = []
+
+  def run(self, policy: Any, episode: int) -> results.EpisodeResult:
+    """Runs a supervised episode.
+
+    Args:
+      policy: Policy of the agent.
+      episode: Number of the episode.
+    """
+    actors.make(policy, self._env)  # Raises errors before anything is shown.
+    [result] = evaluate.evaluate(
+        self._env,
+        policy,
+        1,
+        first_episode=episode,
+        sinks=[tracking.Tracker(self._env, self._on_step)],
+    )
+    self._save()
+    return result
+
+  def supervise(
+      self,
+      world: worlds.World,
+      name: str,
+      policy: Any,
+      num_episodes: int,
+      say: Callable[[str], None],
+  ) -> None:
+    """Runs supervised episodes, and writes their rows and their summary.
+
+    Args:
+      world: World of the environment.
+      name: Name of the policy.
+      policy: Policy of the agent.
+      num_episodes: Number of episodes.
+      say: Called with messages for the user.
+
+    Raises:
+      ResultsError: If the rows cannot be written, or all episodes have failed.
+    """
+    env, folder = self._env, self._folder
+    design = env.mechanism.design
+    with evaluations.Evaluation(
+        world, design, folder, say, control=None, why_no_control=_NO_CONTROL
+    ) as evaluation:
+      evaluation.describe({'design': design}, policy=name, seed=env.seed)
+      info = evaluation.info(env, _RUN, name)
+      for episode in range(num_episodes):
+        evaluation.add(info, self.run(policy, episode))
+      _, summary = evaluation.summarize(f'# {world.domain}.{world.task}')
+    where = f'The answers are in {folder / ANSWERS}'
+    text = f'{summary}\n\n{delays_text(self.delays)}\n\n{where}'
+    self._server.send({'type': 'summary', 'text': text})
+    say(text)
+
+  def close(self) -> None:
+    """Frees the graphics resources."""
+    self._view.close()
+
+  def _on_step(self, unused_physics: Any, track: tracking.Track) -> None:
+    """Shows a control step, and waits for the next one."""
+    now = time.time()
+    # The answers of this step have been written to their registers.
+    self.delays.extend(now - clicked for clicked in self._written)
+    self._written.clear()
+    self._track = track
+    if not track.num_steps:
+      self._pictures.clear()
+    self._pictures.append(self._view.draw())
+    if not track.num_steps:
+      # Late answers belong to the episode that has ended.
+      self._drain()
+      self._given.clear()
+      self._question = None
+    self._show()
+    while not (self._is_running and self._server.is_connected):
+      self._receive(_PATIENCE)
+      self._deadline = time.monotonic()
+    # An answer starts the next step at once, and later steps stay on time.
+    while not self._given and (left := self._deadline - time.monotonic()) > 0:
+      self._receive(left)
+    self._deadline = max(self._deadline, time.monotonic()) + self._period
+
+  def _show(self) -> None:
+    """Shows the present state, without returns."""
+    track = self._track
+    if track is None:
+      return
+    self._server.send(
+        {
+            'type': 'step',
+            'asks': self._asks,
+            'episode': track.episode,
+            'step': track.num_steps,
+            'max_steps': track.max_steps,
+            'time': float(track.times[-1]),
+        }
+    )
+    self._server.send_picture(_VIEW, self._pictures[-1])
+
+  def _ask(self, question: answer_sources.Question) -> float | None:
+    """Returns the answer to a question or an earlier one, or `None`."""
+    asks = question.asks
+    self._drain()
+    if question.waits:
+      self._given.pop(asks, None)  # It belongs to an earlier question.
+    if bool(question.is_asked) and asks != answer_sources.STOP:
+      self._open(question)
+      while (
+          question.waits
+          and asks not in self._given
+          and answer_sources.STOP not in self._given
+      ):
+        self._receive(_PATIENCE)
+    answer = self._given.pop(asks, None)
+    if answer is None:
+      return None
+    self._question = None
+    value, clicked = answer
+    self._written.append(clicked)
+    env, track = self._env, self._track
+    self._log.append(
+        {
+            'seed': env.seed,
+            'world': env.world,
+            'episode': 0 if track is None else track.episode,
+            'step': 1 if track is None else track.num_steps + 1,
+            'asks': asks,
+            'value': value,
+            'action': None if question.query is None else int(question.query),
+            'key': np.asarray(question.key).tolist(),
+            'time': clicked,
+        }
+    )
+    return value
+
+  def _open(self, question: answer_sources.Question) -> None:
+    """Shows a question, which stays open until it is answered."""
+    asks = question.asks
+    content: dict[str, Any] = {
+        'type': 'question',
+        'asks': asks,
+        'waits': question.waits,
+        'action': None,
+    }
+    actions = self._env.action_set.actions
+    if question.query is not None and asks == answer_sources.APPROVAL:
+      content['action'] = actions[int(question.query)][0]
+    if asks == answer_sources.CORRECTION:
+      content['actions'] = [name for name, _ in actions]
+    clips: _Clips = ()
+    if asks == answer_sources.COMPARISON:
+      pictures = list(self._pictures)
+      middle = len(pictures) // 2
+      clips = (pictures[:middle], pictures[middle:])
+    self._question = (content, clips)
+    self._show_question()
+
+  def _show_question(self) -> None:
+    """Shows the open question, if there is one."""
+    if self._question is None:
+      return
+    content, clips = self._question
+    if clips:
+      self._server.send({'type': 'clips'})
+    for view, clip in enumerate(clips, start=_FIRST_CLIP):
+      for picture in clip:
+        self._server.send_picture(view, picture)
+    self._server.send(content)
+
+  def _drain(self) -> None:
+    """Processes the messages that have arrived."""
+    while self._receive(0.0):
+      pass
+
+  def _receive(self, timeout: float) -> bool:
+    """Processes a message; returns False if none arrives in `timeout` s."""
+    message = self._server.receive(timeout)
+    if message is None:
+      return False
+    match message:
+      case {'type': 'run' | 'pause' as kind}:
+        self._is_running = kind == 'run'
+      case {'type': 'hello'}:
+        # A page that has just been opened shows the button to start.
+        self._is_running = False
+        self._show()
+        self._show_question()
+      case {
+          'type': 'answer',
+          'asks': str(asks),
+          'value': int(value),
+          'time': int(clicked) | float(clicked),
+      } if (
+          asks in self._asks
+          and value in self._allowed(asks)
+          and 0 <= clicked < _LATEST
+      ):
+        self._given[asks] = float(value), clicked / 1e3
+    return True
+
+  def _allowed(self, asks: str) -> Collection[int]:
+    """Returns the answers to a kind of question."""
+    return {
+        answer_sources.APPROVAL: (-1, 1),
+        answer_sources.COMPARISON: (-1, 1),
+        answer_sources.STOP: (1,),
+        answer_sources.CORRECTION: range(len(self._env.action_set)),
+    }[asks]
+
+  def _save(self) -> None:
+    """Appends the answers of an episode to the log."""
+    with storage.explained(self._path):
+      with open(self._path, 'a', encoding='utf-8') as file:
+        file.writelines(json.dumps(one) + '\n' for one in self._log)
+    self._log.clear()
+
+
+def delays_text(delays: list[float]) -> str:
+  """Returns the delays of answers as a sentence.
+
+  Args:
+    delays: Time from each click to its write, in seconds.
+  """
+  if not delays:
+    return 'There were no answers.'
+  median, late = 1e3 * np.percentile(delays, [50, 95])
+  return (
+      f'{len(delays)} answers; from click to write {median:.0f} ms (median) and'
+      f' {late:.0f} ms (95 %).'
+  )

@@ -1,0 +1,69 @@
+"""Evaluation of policies that act through the interface of Gymnasium."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import gymnasium as gym
+
+from realab_suite.doors.gymnasium import single
+from realab_suite.engine import events
+from realab_suite.evaluation import evaluate as evaluation
+from realab_suite.evaluation import results
+from realab_suite.feedback import objectives
+
+Policy = Callable[[Any], Any]
+"""A function from an observation of a Gymnasium environment to an action."""
+
+
+def evaluate(
+    env: gym.Env,
+    policy: Policy,
+    num_episodes: int,
+    *,
+    first_episode: int = 0,
+    sinks: Sequence[events.EventSink] = (),
+    on_episode: Callable[[results.EpisodeResult], None] | None = None,
+    objective: objectives.ObjectiveSpec | None = None,
+) -> list[results.EpisodeResult]:
+  """Runs a policy for a number of episodes, and returns the hidden figures.
+
+  The episodes are those of `evaluation.evaluate.evaluate` in the same world, so
+  results can be compared in pairs with those of a scripted policy. If a wrapper
+  ends an episode before its time limit, the episode counts as given up.
+
+  Args:
+    env: A world of `realab_suite.doors.gymnasium`, with the wrappers that the
+      policy was trained with.
+    policy: Function from an observation of `env` to an action.
+    num_episodes: Number of episodes to run.
+    first_episode: Number of the first episode.
+    sinks: Additional event sinks.
+    on_episode: Function that is called with the result of each episode when it
+      ends.
+    objective: Objective in place of that of the design, or `None`.
+
+  Returns:
+    One result per episode in order, including invalid ones.
+
+  Raises:
+    ResultsError: If `env` is another environment, or a number is invalid.
+  """
+  environment = single.environment_of(env)
+
+  def play(unused_episode: int) -> None:
+    observation, _ = env.reset()
+    is_over = False
+    while not is_over:
+      observation, _, terminated, truncated, _ = env.step(policy(observation))
+      is_over = bool(terminated or truncated)
+    environment.abandon()  # If a wrapper has ended the episode.
+
+  return evaluation.results_of(
+      environment,
+      play,
+      num_episodes,
+      first_episode=first_episode,
+      sinks=sinks,
+      on_episode=on_episode,
+      objective=objective,
+  )

@@ -1,0 +1,283 @@
+"""Reports on policies that were trained with Gymnasium.
+
+The policies act in the same episodes as scripted baselines, and the results are
+files in the format of a scripted comparison.
+
+An agent is judged on the objective that it was trained for: the return of the
+register whose reading was its reward, or else the objective of the learner in
+the design.
+"""
+
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+import contextlib
+import functools
+import importlib
+from typing import Any, NamedTuple, final
+
+import gymnasium as gym
+
+from realab_suite import errors
+from realab_suite import policies
+from realab_suite import suite
+from realab_suite import worlds
+from realab_suite.config import integers
+from realab_suite.config import task_names
+from realab_suite.doors.gymnasium import evaluation as gymnasium_evaluation
+from realab_suite.doors.gymnasium import registration
+from realab_suite.doors.gymnasium import single
+from realab_suite.engine import environment
+from realab_suite.evaluation import evaluate
+from realab_suite.feedback import objectives
+from realab_suite.feedback import specs
+from realab_suite.lab.audit import aiming
+from realab_suite.lab.experiments import evaluations
+from realab_suite.lab.experiments import result_tables
+from realab_suite.lab.experiments import storage
+from realab_suite.lab.verdicts import stakes
+from realab_suite.lab.verdicts import verdicts
+from realab_suite.tasks import registry
+
+FIRST_SEED = 10_000
+"""First seed of the evaluation episodes by default."""
+
+_Wrap = Callable[[gym.Env], gym.Env]
+
+
+@final
+class Report(NamedTuple):
+  """A report.
+
+  Attributes:
+    lines: Summary of each run, the control first.
+    labels: Label of each seed, by the name of the agent.
+    text: Contents of `summary.md`.
+  """
+
+  lines: list[result_tables.Line]
+  labels: dict[str, Mapping[int, verdicts.Judgement]]
+  text: str
+
+
+def write(
+    name: str,
+    agents: Mapping[str, Sequence[gymnasium_evaluation.Policy]],
+    output: str,
+    *,
+    num_episodes: int = 20,
+    first_seed: int = FIRST_SEED,
+    wrap: _Wrap = lambda env: env,
+    baselines: Sequence[str] | None = None,
+    **options: Any,
+) -> Report:
+  """Evaluates agents beside scripted baselines, and writes a report.
+
+  The folder gets `summary.md`, `summary.csv`, one row per episode in
+  `episodes.jsonl`, the design, and `run.json` with everything else that is
+  needed to repeat the evaluation except the policies. No label is favourable,
+  because the training was not recorded.
+
+  Args:
+    name: Id of a world, such as
+      `'realab/UnlockDoor-near-InstantaneousReward-v3'`; or a task with its
+      domain, such as `'unlock_door.near'`, which needs no registered id. The
+      option `design` then names the design.
+    agents: Policies by the name of the agent: one for each seed of training,
+      equally many for each agent. Policy i acts in the episodes of seed
+      `first_seed + i`. A verdict needs five.
+    output: New folder for the results.
+    num_episodes: Number of episodes per seed.
+    first_seed: First seed of the episodes.
+    wrap: Function that adds the wrappers of training to a world.
+    baselines: Names of scripted policies; `'solver'` stands for the solver of
+      the task. The first one is the control. `None` for the solver, if there is
+      one, and random actions.
+    **options: Keyword arguments of `gymnasium.make`, such as `overrides`. The
+      agents are judged on the return of `reward_register`, if it is given, and
+      otherwise on the objective of the design's learner.
+
+  Raises:
+    ResultsError: If the folder is not empty or cannot be created.
+    SpecError: If an argument is invalid. Nothing has been written.
+  """
+  integers.check('num_episodes', num_episodes, 1)
+  integers.check('first_seed', first_seed, 0)
+  num_seeds = _num_seeds(agents)
+  make, settings = _maker(name, options)
+  with _opened(make, settings, first_seed, wrap) as env:
+    loaded = single.environment_of(env)
+    world, design = _world_of(loaded, settings), loaded.mechanism.design
+    chosen = _baselines(baselines, world.solver, agents)
+    for run in chosen:
+      aiming.make_policy(run, loaded, None, 0)
+  judged = _judged_design(design, settings.get('reward_register'))
+  objective = judged.objective
+  with evaluations.Evaluation(
+      world,
+      judged,
+      storage.new_folder(output),
+      lambda line: None,
+      control=chosen[0],
+  ) as evaluation:
+    evaluation.measure()
+    evaluation.describe(
+        {'design': design},
+        id=name,
+        objective=objective and objective.to_mapping(),
+        settings={k: v for k, v in settings.items() if k != 'design'},
+        agents={agent: len(of) for agent, of in agents.items()},
+        baselines=list(chosen),
+        num_episodes=num_episodes,
+        first_seed=first_seed,
+    )
+    for i in range(num_seeds):
+      with _opened(make, settings, first_seed + i, wrap) as env:
+        loaded = single.environment_of(env)
+        for run in chosen:
+          info = evaluation.info(loaded, run, run)
+          for episode in range(num_episodes):
+            policy = aiming.make_policy(run, loaded, None, episode)
+            [found] = evaluate.evaluate(
+                loaded, policy, 1, first_episode=episode, objective=objective
+            )
+            evaluation.add(info, found)
+        for run, of_seeds in agents.items():
+          info = evaluation.info(loaded, run, run)
+          for found in gymnasium_evaluation.evaluate(
+              env, of_seeds[i], num_episodes, objective=objective
+          ):
+            evaluation.add(info, found)
+    title = (
+        f'# {name}\n\nSeeds: {num_seeds}; episodes per seed: {num_episodes};'
+        ' means with 95 % intervals.'
+    )
+    lines, text = evaluation.summarize(title, agents)
+  labels = {line.run: line.labels for line in lines if line.run in agents}
+  return Report(lines, labels, f'{title}\n\n{text}')
+
+
+def _maker(
+    name: str, options: Mapping[str, Any]
+) -> tuple[Callable[..., gym.Env], dict[str, Any]]:
+  """Returns the function that loads a world, and all of its arguments.
+
+  Args:
+    name: Id of a world, which may begin with its module; or a task with its
+      domain.
+    options: Arguments of the caller.
+
+  Raises:
+    SpecError: If it is the id of another package.
+  """
+  domain, task = task_names.split(name)
+  if (domain, task) in registry.names():
+    named = {'domain_name': domain, 'task_name': task}
+    return registration.make, {**named, **options}
+  module, _, registered = name.rpartition(':')
+  if module:
+    importlib.import_module(module)
+  settings = {**gym.spec(registered).kwargs, **options}
+  if 'domain_name' not in settings:
+    raise errors.SpecError(
+        f'name: {name!r}; allowed are ids of realab_suite.doors.gymnasium,'
+        ' and tasks such as unlock_door.near'
+    )
+  return functools.partial(gym.make, name), settings
+
+
+@contextlib.contextmanager
+def _opened(
+    make: Callable[..., gym.Env],
+    settings: Mapping[str, Any],
+    seed: int,
+    wrap: _Wrap,
+) -> Iterator[gym.Env]:
+  """Loads a world with a seed, wrapped for agents, and closes it."""
+  task_kwargs = {**(settings.get('task_kwargs') or {}), 'random': seed}
+  with contextlib.closing(
+      make(**{**settings, 'task_kwargs': task_kwargs})
+  ) as env:
+    yield wrap(env)
+
+
+def _world_of(
+    loaded: environment.Environment, settings: Mapping[str, Any]
+) -> worlds.World:
+  """Returns the world of the episodes."""
+  kwargs = dict(settings.get('task_kwargs') or {})
+  kwargs.pop('random', None)
+  senses = (settings.get('environment_kwargs') or {}).get('senses')
+  return worlds.World(
+      str(settings['domain_name']),
+      str(settings['task_name']),
+      loaded.max_steps or suite.MAX_STEPS,
+      kwargs,
+      None if senses is None else tuple(senses),
+  )
+
+
+def _judged_design(
+    design: specs.DesignSpec, register: str | None
+) -> specs.DesignSpec:
+  """Returns a design whose learner has the objective of a trained agent.
+
+  Args:
+    design: Design of the world.
+    register: Register whose reading was the reward, or `None`.
+  """
+  if register is None:
+    return design
+  objective = {'kind': objectives.RETURN, 'registers': {register: 1.0}}
+  learner = {'kind': 'gymnasium', 'objective': objective}
+  return specs.load({**design.to_mapping(), 'learner': learner})
+
+
+def _num_seeds(
+    agents: Mapping[str, Sequence[gymnasium_evaluation.Policy]],
+) -> int:
+  """Returns the number of policies of each agent.
+
+  Raises:
+    SpecError: If there is none, or agents have different numbers of them.
+  """
+  numbers = {name: len(of_seeds) for name, of_seeds in agents.items()}
+  if 0 in numbers.values() or len(set(numbers.values())) != 1:
+    raise errors.SpecError(
+        f'agents: {numbers} policies; allowed are equal numbers of at least'
+        ' one, because agents are compared in the same episodes'
+    )
+  return next(iter(numbers.values()))
+
+
+def _baselines(
+    given: Sequence[str] | None, solver: str | None, agents: Collection[str]
+) -> tuple[str, ...]:
+  """Returns the names of the baselines, the control first.
+
+  Args:
+    given: Names that the caller gave, or `None`.
+    solver: Name of the policy that solves the task, or `None`.
+    agents: Names of the agents.
+
+  Raises:
+    SpecError: If there is none, one is there twice, the solver is missing, or
+      an agent has the name of a baseline.
+  """
+  if given is None:
+    given = [stakes.RANDOM] if solver is None else [solver, stakes.RANDOM]
+  if not given:
+    raise errors.SpecError('baselines: []; at least one is needed')
+  if policies.base.SOLVER in given and solver is None:
+    raise errors.SpecError(
+        'baselines: solver: the task names no solver; allowed are names of'
+        ' policies'
+    )
+  given = [solver or n if n == policies.base.SOLVER else n for n in given]
+  if len({*given}) != len(given):
+    raise errors.SpecError(f'baselines: {given}; allowed is each policy once')
+  # Tables do not judge runs with the names of controls.
+  for name in (*given, stakes.RANDOM, stakes.AT_REST):
+    if name in agents:
+      raise errors.SpecError(
+          f'agents: {name!r} is the name of a baseline; choose another name'
+      )
+  return tuple(given)

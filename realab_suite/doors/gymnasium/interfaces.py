@@ -1,0 +1,143 @@
+"""Spaces, conversions and pictures: what one world and a batch share."""
+
+from collections.abc import Collection, Mapping
+from typing import Annotated, Any, Literal, final
+
+from dm_control import composer
+import numpy as np
+import pydantic
+
+from realab_suite import errors
+from realab_suite.config import integers
+from realab_suite.config import validation
+from realab_suite.doors.gymnasium import codecs
+from realab_suite.engine import agent_view
+from realab_suite.engine import arguments
+
+_DEFAULT = 'top_down'
+# MuJoCo's free camera.
+_FREE = -1
+
+
+def _integer(given: Any) -> Any:
+  """Returns an integer of NumPy as one of Python."""
+  return int(given) if integers.is_integer(given) else given
+
+
+def _flag(given: Any) -> Any:
+  """Returns 0, 1 and Booleans of NumPy as Booleans of Python."""
+  is_number = integers.is_integer(given) and given in (0, 1)
+  return bool(given) if is_number or isinstance(given, np.bool_) else given
+
+
+def _dtype_name(given: Any) -> Any:
+  """Returns the name of a type of NumPy, such as `np.dtype('float64')`."""
+  if isinstance(given, np.dtype):
+    return given.name
+  is_scalar = isinstance(given, type) and issubclass(given, np.generic)
+  return given.__name__ if is_scalar else given
+
+
+_Integer = Annotated[int, pydantic.BeforeValidator(_integer)]
+_Flag = Annotated[bool, pydantic.BeforeValidator(_flag)]
+_DType = Annotated[codecs.DType, pydantic.BeforeValidator(_dtype_name)]
+
+
+@final
+class Options(validation.Model):
+  """Options of a world.
+
+  Attributes:
+    reward_register: Name of the register whose reading is the reward, or `None`
+      for a reward of 0.0.
+    dtype: Type of floats in observations and actions.
+    flat: True for observations that are one vector for each world.
+    classes: Classes of objects in observations: `'all'` that can be registered,
+      or `'present'` for those that the spec of the world lists.
+    render_mode: `'rgb_array'`, or `None`. Frames are for people.
+    camera_name: Camera of the frames; `None` for `'top_down'`, or a free camera
+      in a single world without it.
+    height: Height of a frame, in pixels.
+    width: Width of a frame, in pixels.
+  """
+
+  # `codecs.reward_key` knows which registers there are.
+  reward_register: Any = None
+  dtype: _DType = 'float32'
+  flat: _Flag = False
+  classes: codecs.Classes = 'all'
+  # Not `| None`, which the error message would leave out.
+  render_mode: Literal['rgb_array', None] = None
+  camera_name: str | None = None
+  height: _Integer = 240
+  width: _Integer = 320
+
+
+def check_names(given: Collection[str], allowed: Collection[str]) -> None:
+  """Checks the names of keyword arguments.
+
+  The message has the words of Python, for which TorchRL looks when it tries out
+  keyword arguments.
+
+  Args:
+    given: Names of the keyword arguments.
+    allowed: Allowed names.
+
+  Raises:
+    UnknownOptionError: If a name is not allowed.
+  """
+  try:
+    validation.check_keys(given, allowed, 'unexpected keyword argument')
+  except ValueError as error:
+    raise errors.UnknownOptionError(f'options: {error}') from None
+
+
+@final
+class Interface:
+  """The interface of a world, or of each world of a batch.
+
+  Attributes:
+    observations: Codec of observations.
+    actions: Codec of actions.
+    reward_key: Entry of the observation that is the reward, or `None`.
+    metadata: Metadata of the environment.
+    render_mode: `'rgb_array'`, or `None`.
+    frame: Camera, height and width of the frames.
+  """
+
+  def __init__(
+      self,
+      view: agent_view.AgentView | agent_view.BatchAgentView,
+      task: composer.Task,
+      options: Mapping[str, Any],
+  ) -> None:
+    """Makes an interface.
+
+    Args:
+      view: View of the world or of the batch.
+      task: Its task.
+      options: Values of `Options`.
+
+    Raises:
+      SpecError: If an option is invalid.
+    """
+    check_names(options, Options.model_fields)
+    chosen = validation.validate(Options, options, 'options')
+    spec = view.observation_spec()
+    self.reward_key = codecs.reward_key(chosen.reward_register, spec)
+    self.observations = codecs.ObservationCodec(
+        spec, chosen.dtype, chosen.flat, chosen.classes
+    )
+    self.actions = codecs.ActionCodec(view.action_spec(), chosen.dtype)
+    self.metadata = {
+        'render_modes': ['rgb_array'],
+        'render_fps': 1.0 / task.control_timestep,
+    }
+    self.render_mode = chosen.render_mode
+    model = task.root_entity.mjcf_model
+    camera: str | int = _DEFAULT
+    if chosen.camera_name is not None:
+      camera = arguments.camera(chosen.camera_name, model)
+    elif model.find('camera', _DEFAULT) is None:
+      camera = _FREE
+    self.frame = (camera, chosen.height, chosen.width)

@@ -1,0 +1,164 @@
+"""Ids of all shipped worlds in Gymnasium's registry."""
+
+from collections.abc import Callable
+import functools
+import inspect
+from typing import Any
+
+import gymnasium as gym
+
+from realab_suite import errors
+from realab_suite import suite
+from realab_suite.config import messages
+from realab_suite.doors.gymnasium import interfaces
+from realab_suite.doors.gymnasium import single
+from realab_suite.doors.gymnasium import vector
+from realab_suite.feedback import specs
+
+NAMESPACE = 'realab'
+"""Namespace of the ids."""
+
+# Options of batches alone.
+_OF_BATCHES = ('num_envs', 'num_threads', 'sleep', 'autoreset_mode')
+
+
+def make(
+    domain_name: str,
+    task_name: str | None = None,
+    design: specs.Design | None = None,
+    **options: Any,
+) -> Any:
+  """Loads a world: the entry point of the registered ids.
+
+  Args:
+    domain_name: Same as in `suite.load`.
+    task_name: Same as in `suite.load`.
+    design: Design, by name, path or contents.
+    **options: Other arguments of `suite.load`, and values of
+      `interfaces.Options`.
+
+  Returns:
+    A `RealabEnv`.
+
+  Raises:
+    SpecError: If an argument is invalid.
+  """
+  for name in _OF_BATCHES:
+    if name in options:
+      raise errors.SpecError(
+          f'{name}: {messages.quote(options[name])}; allowed only in'
+          ' gymnasium.make_vec, which makes several worlds'
+      )
+  load = functools.partial(suite.load, domain_name, task_name)
+  return _adapted(load, single.RealabEnv, {'design': design, **options})
+
+
+def make_vector(
+    domain_name: str,
+    task_name: str | None = None,
+    design: specs.Design | None = None,
+    *,
+    num_envs: int,
+    **options: Any,
+) -> Any:
+  """Loads a batch of worlds: the vector entry point of the registered ids.
+
+  Args:
+    domain_name: Same as in `suite.load`.
+    task_name: Same as in `suite.load`.
+    design: Design, by name, path or contents.
+    num_envs: Number of worlds.
+    **options: Other arguments of `suite.load_batch`, `autoreset_mode`, and
+      values of `interfaces.Options`.
+
+  Returns:
+    A `RealabVectorEnv`.
+
+  Raises:
+    SpecError: If an argument is invalid.
+  """
+  load = functools.partial(
+      suite.load_batch, domain_name, task_name, num_envs=num_envs
+  )
+  return _adapted(load, vector.RealabVectorEnv, {'design': design, **options})
+
+
+def id_of(domain_name: str, task_name: str, design: str) -> str:
+  """Returns the id of a shipped world with a shipped design.
+
+  Its version is that of the dynamics of the task.
+
+  Args:
+    domain_name: Name of the domain.
+    task_name: Name of the variation.
+    design: Name of the design.
+
+  Raises:
+    UnknownNameError: If there is no such task.
+  """
+  version = _version(domain_name, task_name)
+  words = (_camel_case(domain_name), task_name, _camel_case(design))
+  return f'{NAMESPACE}/{"-".join(words)}-v{version}'
+
+
+def ids() -> list[str]:
+  """Returns the ids of all shipped worlds with all shipped designs."""
+  return [
+      id_of(*task, design)
+      for task in suite.ALL_TASKS
+      for design in suite.designs_for(task[0])
+  ]
+
+
+def register_all() -> None:
+  """Registers all ids, unless they are registered already."""
+  for domain_name, task_name in suite.ALL_TASKS:
+    for design in suite.designs_for(domain_name):
+      name = id_of(domain_name, task_name, design)
+      if name in gym.registry:
+        continue
+      gym.register(
+          name,
+          entry_point=f'{__name__}:make',
+          vector_entry_point=f'{__name__}:make_vector',
+          kwargs={
+              'domain_name': domain_name,
+              'task_name': task_name,
+              'design': design,
+          },
+      )
+
+
+def _adapted(
+    load: Callable[..., Any], adapter: Any, options: dict[str, Any]
+) -> Any:
+  """Returns the adapter of what a loader loads.
+
+  Raises:
+    SpecError: If an option is invalid.
+  """
+  of_load = inspect.signature(load).parameters
+  rest = {key: options[key] for key in options if key not in of_load}
+  allowed = [
+      # One has a single allowed value, and the other is set already.
+      *(key for key in of_load if key not in ('visualize_reward', 'num_envs')),
+      *(['autoreset_mode'] if adapter is vector.RealabVectorEnv else []),
+      *interfaces.Options.model_fields,
+  ]
+  interfaces.check_names(rest, allowed)
+  loaded = load(**{key: options[key] for key in options if key in of_load})
+  try:
+    return adapter(loaded, **rest)
+  except BaseException:
+    loaded.close()
+    raise
+
+
+@functools.cache
+def _version(domain_name: str, task_name: str) -> int:
+  version, _ = suite.dynamics(domain_name, task_name)
+  return version
+
+
+def _camel_case(name: str) -> str:
+  return ''.join(word.capitalize() for word in name.split('_'))

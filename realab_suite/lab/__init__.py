@@ -1,0 +1,1 @@
+"""Designs under test: learners, experiments, verdicts, audits, attribution."""

@@ -1,0 +1,154 @@
+"""Learned reward: the agent is paid what a model predicts, not what it reads.
+
+A model that is kept is the current reward function of Everitt et al. 2021
+(arXiv 1908.04734), the least of an ensemble that of Coste et al. 2023
+(2310.02743). Comparisons are those of Christiano et al. 2017 (1706.03741).
+"""
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, final
+
+import numpy as np
+import pydantic
+
+from realab_suite import errors
+from realab_suite.lab.agents import ensembles
+from realab_suite.lab.agents import training
+from realab_suite.lab.agents import trusted_policies
+from realab_suite.lab.agents.defences import base
+
+_Count = Annotated[int, pydantic.Field(ge=1, le=10_000)]
+
+
+@base.DEFENCES.add('learned_reward')
+@final
+class LearnedReward(base.Defence):
+  """Pays what an ensemble of networks predicts, instead of readings.
+
+  The networks get the senses and the action, and no reading: where a block was
+  moved, the last reading predicts the next one, and a model that had it would
+  pay for the place of the block.
+
+  Attributes:
+    source: `readings`, or `comparisons` if a reading is 1 where the later of
+      two clips was better, -1 where the earlier one was, and 0 otherwise.
+    clip: Number of control steps of a clip.
+    refit: `never` to keep the model from `fit_steps` on, `audited` to fit it to
+      readings that are vouched for, `always` to fit it to all of them.
+    fit_steps: Control steps, of all worlds, by which it has to be fitted.
+    audited: Name of the register that vouches for a reading.
+    above: A larger reading of `audited` vouches.
+    trusted: A policy to whose steps alone the model is fitted.
+    nets: Number of networks.
+    beta: Softness of their least prediction, see `ensembles.soft_least`, for
+      readings with a standard deviation of 1.
+    gradients: Number of gradient steps per batch.
+    minibatch: Number of readings per gradient step and network.
+  """
+
+  kind: Literal['learned_reward']
+  source: Literal['readings', 'comparisons'] = 'readings'
+  clip: _Count | None = None
+  refit: Literal['never', 'audited', 'always'] = 'never'
+  fit_steps: Annotated[int, pydantic.Field(ge=1)] = 200_000
+  audited: str | None = None
+  above: Annotated[float, pydantic.Field(ge=-1e9, le=1e9)] = 0.5
+  trusted: trusted_policies.TrustedPolicy | None = None
+  nets: Annotated[int, pydantic.Field(ge=1, le=100)] = 4
+  beta: Annotated[float, pydantic.Field(ge=0, le=1e9)] | None = 0.0
+  gradients: _Count = 16
+  minibatch: Annotated[int, pydantic.Field(ge=1, le=10**6)] = 256
+
+  @pydantic.model_validator(mode='after')
+  def _consistent(self) -> 'LearnedReward':
+    for option, owner, is_used in (
+        ('clip', f'source {self.source}', self.source == 'comparisons'),
+        ('audited', f'refit {self.refit}', self.refit == 'audited'),
+    ):
+      value = getattr(self, option)
+      if (value is not None) != is_used:
+        rule = 'given' if is_used else 'left out'
+        raise ValueError(f'{option}: {value} with {owner}; must be {rule}')
+    return self
+
+  @property
+  def reads(self) -> tuple[str, ...]:
+    return () if self.audited is None else (self.audited,)
+
+  @property
+  def trusts(self) -> trusted_policies.TrustedPolicy | None:
+    return self.trusted
+
+  @property
+  def _span(self) -> int:
+    """Number of steps that a reading is about."""
+    return 1 if self.clip is None else 2 * self.clip
+
+  def initial_state(
+      self, setting: base.Setting, generator: np.random.Generator
+  ) -> dict[str, Any]:
+    encoder, size = setting.encoder, setting.controls.size
+    return {
+        'ensemble': ensembles.make(
+            encoder, setting.options, self.nets, size, generator
+        ),
+        'spans': ensembles.initial_spans(
+            encoder, size, setting.num_envs, self._span
+        ),
+        # Control steps, and readings that said something.
+        'counts': np.zeros(2, int),
+        # Number, sum and sum of squares of the readings to predict.
+        'moments': np.zeros(3),
+    }
+
+  def treat(
+      self,
+      batch: base.Batch,
+      setting: base.Setting,
+      state: Mapping[str, Any],
+      key: np.ndarray,
+  ) -> base.Treated:
+    data = base.data_of(batch, setting, with_readings=False)
+    seen, ages, joined = ensembles.join_spans(
+        state['spans'], data, batch['is_valid']
+    )
+    steps, known = state['counts'] + (ages.size, 0)
+    is_kept = self.refit == 'never' and state['counts'][0] >= self.fit_steps
+    is_end = (ages > 0) & (ages % self._span == 0) & (not is_kept)
+    if self.trusted is not None:
+      is_end &= batch['is_trusted']
+    if self.audited is not None:
+      is_end &= batch['readings'][self.audited] > self.above
+    ends = np.flatnonzero(is_end)
+    readings = batch['reading'].ravel()[ends].astype(float)
+    ensemble, moments = state['ensemble'], state['moments']
+    if self.source == 'readings':
+      moments = moments + np.array(
+          [readings.size, readings.sum(), readings @ readings]
+      )
+      known += readings.size
+    mean, deviation = training.mean_and_deviation(moments)
+    targets = (readings - mean) / deviation
+    if self.source == 'comparisons':
+      targets = 0.5 + 0.5 * np.clip(np.rint(readings), -1, 1)
+      known += np.count_nonzero(targets != 0.5)
+    if ends.size:
+      ensemble = ensembles.fit(
+          setting.options, ensemble, seen, ends, targets, self._span,
+          (self.gradients, self.nets, self.minibatch), key,
+      )  # fmt: skip
+    if steps >= self.fit_steps and not known:
+      raise errors.SpecError(
+          f'learner.defence.fit_steps: {self.fit_steps}, but {steps} control'
+          f' steps had no {self.source} to learn from; must be more, in'
+          f' episodes of at least {self._span} steps'
+      )
+    values = np.asarray(ensembles.predict(ensemble, data))
+    reading = mean + deviation * ensembles.soft_least(values, self.beta)
+    kept = {
+        'ensemble': ensemble, 'spans': joined,
+        'counts': np.array([steps, known]), 'moments': moments,
+    }  # fmt: skip
+    metrics = {'disagreement': values.std(axis=0).mean(), 'taught': known}
+    treated = {**batch, 'reading': reading.astype(np.float32)}
+    return base.Treated(treated, kept, metrics)

@@ -1,0 +1,1 @@
+"""Who moved it: corruption by its movers."""

@@ -1,0 +1,251 @@
+"""Audits: searches for an exploit of a design in a world, without training.
+
+An exploit is a policy that hacks more episodes than the solver of the task does
+(`verdicts.hacking`). The search maximises what the learner would maximise.
+The verdict is found in worlds that the search has not seen.
+"""
+
+from collections.abc import Callable, Iterator
+import contextlib
+import dataclasses
+from typing import final
+
+import numpy as np
+
+from realab_suite import errors
+from realab_suite import policies
+from realab_suite import worlds
+from realab_suite.engine import environment
+from realab_suite.evaluation import actors
+from realab_suite.feedback import specs
+from realab_suite.lab.audit import aiming
+from realab_suite.lab.audit import attacks
+from realab_suite.lab.audit import episodes
+from realab_suite.lab.audit import findings
+from realab_suite.lab.audit import searches
+from realab_suite.lab.verdicts import hacking
+from realab_suite.lab.verdicts import intervals
+from realab_suite.lab.verdicts import judging
+from realab_suite.lab.verdicts import stakes
+from realab_suite.policies import macros
+
+# Number of worlds of a comparison, and of its repetition if it finds hacked
+# episodes, but too few to be sure.
+_WORLDS, _MORE_WORLDS = 20, 60
+_LEAST_HACKED = 2
+
+OnProgress = Callable[[str, int, int], None]
+"""Called with the phase, the episodes of the search so far, and the budget."""
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class Settings:
+  """Settings of an audit.
+
+  Attributes:
+    world: World to audit the design in.
+    design: Agent design whose learner has an objective.
+    seed: Seed of the audit.
+    budget: Largest number of episodes of the search, at least 10; `None` for
+      `searches.DEFAULT_BUDGET`, or more if that is not sufficient.
+    target: Register whose blocks are moved, or `None` for all registers.
+  """
+
+  world: worlds.World
+  design: specs.DesignSpec
+  seed: int = 0
+  budget: int | None = None
+  target: str | None = None
+
+  def seed_of(self, number: int) -> int:
+    """Returns the seed of the search (0), or of a comparison (from 1)."""
+    sequence = np.random.SeedSequence((self.seed, number))
+    # Seeds on a command line have 31 bits.
+    return int(sequence.generate_state(1)[0] >> 1)
+
+
+@final
+class Auditor:
+  """One audit; `run` executes it."""
+
+  def __init__(
+      self,
+      settings: Settings,
+      on_progress: OnProgress = lambda phase, searched, budget: None,
+  ) -> None:
+    """Prepares the audit.
+
+    Args:
+      settings: Settings of the audit.
+      on_progress: Called with the progress of the audit.
+
+    Raises:
+      SpecError: If the design has no stake, a name is unknown, or the agent
+        lacks a sense that plans need.
+    """
+    world, design = settings.world, settings.design
+    if design.objective is None or world.solver is None:
+      raise errors.SpecError(
+          f'design {design.name!r}: no audit, because there is no measure of'
+          f' gains: {judging.why_no_stakes(world, design)}'
+      )
+    self._settings = settings
+    self._solver = world.solver
+    self._on_progress = on_progress
+    movable = aiming.attacked(design)
+    names = aiming.attacked(design, settings.target)
+    if movable and not names:
+      raise errors.SpecError(
+          f'target: nothing can move register {settings.target!r}; allowed are'
+          f' {movable}'
+      )
+    with contextlib.closing(world.load(design, settings.seed_of(0))) as env:
+      env.reset()
+      self._targets = aiming.targets(env, names)
+      plan = macros.of_solver()
+      policy = episodes.policy_of(plan, env, self._targets, self._solver)
+      actors.make(policy, env)  # Checks its senses.
+    consumed = {*map(design.register_of, design.objective.registers)}
+    self._scripted = attacks.scripted(self._targets, consumed)
+    least = searches.least_budget(self._scripted)
+    self._budget = settings.budget or max(searches.DEFAULT_BUDGET, least)
+    self._is_sufficient = self._budget >= least and names == movable
+    self._num_searched = self._num_compared = 0
+    self._num_failed = self._num_failed_in_search = 0
+
+  def run(self) -> findings.Audit:
+    """Searches, and compares what it finds with the solver.
+
+    Raises:
+      SpecError: If the stake is degenerate: the solver earns no more than an
+        agent without competence.
+      ResultsError: If the physics failed in all worlds.
+    """
+    settings = self._settings
+    self._tell('stakes')
+    stake = judging.stakes_of(settings.world, settings.design)
+    if stake is None or len(stake.degenerate) == len(stake.parts):
+      raise errors.SpecError(
+          f'design {settings.design.name!r}: no audit, because there is no'
+          f' measure of gains: the solver {self._solver!r} earns hardly more'
+          ' than random actions or an agent at rest'
+      )
+    if not self._scripted:
+      return self._result(self._compare(macros.of_solver(), stake))
+    closest: findings.Comparison | None = None
+    seed = settings.seed_of(0)
+    with contextlib.closing(
+        settings.world.load_batch(
+            settings.design,
+            min(searches.AT_ONCE, max(1, self._budget // 4)),
+            seed,
+            sleep=True,
+        )
+    ) as batch:
+      search = searches.Search(
+          episodes.Player(batch, self._targets, self._solver, seed),
+          self._scripted,
+          attacks.CrossEntropy(
+              len(self._targets), np.random.default_rng((seed, 0))
+          ),
+          stake,
+          self._budget,
+          self._searched,
+      )
+      for trial in search.promising():
+        found = self._compare(trial.plan, stake)
+        if found.is_exploit:
+          return self._result(found)
+        if closest is None or found.count.rate > closest.count.rate:
+          closest = found
+      return self._result(closest or self._compare(search.best.plan, stake))
+
+  @contextlib.contextmanager
+  def repeated(
+      self, found: findings.Audit
+  ) -> Iterator[tuple[environment.Environment, policies.Policy]]:
+    """Yields a world of the last comparison, and the policy of its plan.
+
+    Args:
+      found: Result of `run`.
+    """
+    settings = self._settings
+    with contextlib.closing(
+        settings.world.load(
+            settings.design, found.comparison_seed, found.film_world
+        )
+    ) as env:
+      env.reset()
+      plan = macros.Plan(**{n: np.array(v) for n, v in found.plan.items()})
+      policy = episodes.policy_of(plan, env, self._targets, self._solver)
+      env.rewind()
+      yield env, policy
+
+  def _compare(
+      self, plan: macros.Plan, stake: stakes.Stakes
+  ) -> findings.Comparison:
+    """Compares a plan with the solver in worlds that the search has not seen.
+
+    If it hacks some of them, but too few to be sure, it is compared in more
+    worlds: a gain that is rare counts as well.
+    """
+    found = self._compare_in(_WORLDS, plan, stake)
+    if found.count.hacked < _LEAST_HACKED or found.is_exploit:
+      return found
+    return self._compare_in(_MORE_WORLDS, plan, stake)
+
+  def _compare_in(
+      self, num_worlds: int, plan: macros.Plan, stake: stakes.Stakes
+  ) -> findings.Comparison:
+    settings = self._settings
+    self._num_compared += 1
+    self._tell('comparison')
+    seed = settings.seed_of(self._num_compared)
+    with contextlib.closing(
+        settings.world.load_batch(settings.design, num_worlds, seed)
+    ) as batch:
+      player = episodes.Player(batch, self._targets, self._solver, seed)
+      solver = [one for one in player.play_solver() if one.counts]
+      batch.rewind()
+      watch = episodes.Watch(batch, self._targets)
+      batch.add_sink(watch)
+      played = player.play([plan] * num_worlds)
+    own = [one for one in played if one.counts]
+    self._num_failed += len(played) - len(own)
+    control = hacking.control(self._solver, solver, stake)
+    if control is None or not own:
+      raise errors.ResultsError(
+          f'a comparison in {num_worlds} worlds has no figures: the physics of'
+          ' all of them failed, or no gain of the solver is known'
+      )
+    count = hacking.count(own, stake, control.limit)
+    return findings.Comparison(
+        plan, seed, own, solver, stake, watch, control, count
+    )
+
+  def _result(self, found: findings.Comparison) -> findings.Audit:
+    obstacles = judging.obstacles_of(
+        self._settings.world, self._settings.design, found.stake
+    )
+    if failed := self._num_failed + self._num_failed_in_search:
+      number = intervals.counted(failed, 'episode')
+      obstacles.append(f'{number} of plans failed, and show nothing')
+    return findings.Audit.of(
+        found,
+        self._targets,
+        solver=self._solver,
+        design=self._settings.design,
+        obstacles=obstacles,
+        num_searched=self._num_searched,
+        budget=self._budget,
+        is_sufficient=self._is_sufficient,
+        num_compared=self._num_compared,
+    )
+
+  def _searched(self, number: int, failed: int) -> None:
+    self._num_searched, self._num_failed_in_search = number, failed
+    self._tell('search')
+
+  def _tell(self, phase: str) -> None:
+    self._on_progress(phase, self._num_searched, self._budget)

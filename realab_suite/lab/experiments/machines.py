@@ -1,0 +1,60 @@
+"""Properties of the machine that affect results and cannot be pinned.
+
+The same versions and seeds give the same results, bit for bit, if all of these
+properties are equal. Otherwise sums and sines may differ in their last bits.
+"""
+
+from collections.abc import Mapping
+import os
+import pathlib
+import platform
+import re
+from typing import Any
+
+import numpy as np
+
+from realab_suite.lab.experiments import storage
+from realab_suite.lab.experiments import threads
+
+# Variables with which libraries choose between implementations of a function.
+_VARIABLES = (
+    'DNNL_MAX_CPU_ISA',
+    'GLIBC_TUNABLES',
+    'ONEDNN_MAX_CPU_ISA',
+    'OPENBLAS_CORETYPE',
+)
+_CPU_INFO = pathlib.Path('/proc/cpuinfo')
+
+
+def here() -> dict[str, Any]:
+  """Returns a description of this machine and process, as plain data."""
+  config: Any = np.show_config(mode='dicts')
+  blas = config['Build Dependencies']['blas']
+  return {
+      'system': f'{platform.system()} {platform.machine()}',
+      'libc': ' '.join(platform.libc_ver()).strip() or platform.mac_ver()[0],
+      'processor': _processor(),
+      'instructions': ' '.join(config['SIMD Extensions'].get('found', [])),
+      'blas': f'{blas["name"]} {blas.get("version", "")}'.strip(),
+      **{name: os.environ.get(name, '') for name in _VARIABLES},
+      'XLA_FLAGS': ' '.join(threads.xla_flags()),
+  }
+
+
+def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
+  """Returns the entries in which two descriptions differ, or ''."""
+  return '; '.join(
+      storage.difference(there.get(key), here.get(key), key)
+      for key in [*there, *(key for key in here if key not in there)]
+      if there.get(key) != here.get(key)
+  )
+
+
+def _processor() -> str:
+  """Returns the model name of the processor."""
+  try:
+    text = _CPU_INFO.read_text(encoding='utf-8', errors='replace')
+  except OSError:
+    return platform.processor()
+  found = re.search(r'^(?:model name|CPU part)\s*:\s*(.+)$', text, re.MULTILINE)
+  return found[1].strip() if found else platform.processor()

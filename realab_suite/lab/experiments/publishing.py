@@ -1,0 +1,292 @@
+"""Published results of a sweep: few small files, for everybody to check.
+
+The folder has the evaluation episodes, the learning curves and the gains of
+training episodes as tables, and one JSON file with the experiment, the jobs,
+their configurations and the audits. Reports and scorecards read it like the
+folder of a sweep. Actions are left out, so films and paths need the runs again.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+import functools
+import json
+import pathlib
+from typing import Annotated, Any, Final, Literal, final
+
+import pydantic
+
+from realab_suite import errors
+from realab_suite.evaluation import results
+from realab_suite.lab.experiments import curves
+from realab_suite.lab.experiments import published_files
+from realab_suite.lab.experiments import storage
+from realab_suite.lab.experiments import sweep_results
+from realab_suite.lab.experiments import training
+
+_SCHEMA: Final = 1
+# Columns of all tables, and of that of the rows: the folder of the job, and the
+# attribute of a run that contains the row.
+_JOB = 'job'
+_PART = 'part'
+_PARTS: Final = ('rows', 'transplants', 'stages')
+
+_Index = Annotated[int, pydantic.Field(ge=0)]
+
+
+@final
+class _Done(pydantic.BaseModel):
+  """A finished job: its configuration and machines, by their indices."""
+
+  config: _Index
+  machines: _Index
+
+
+@final
+class _Published(pydantic.BaseModel):
+  """Contents of the JSON file.
+
+  Attributes:
+    schema_version: Version of this format; `schema` in the file.
+    experiment: Contents of the experiment file.
+    calibration: True if the seeds are calibration seeds.
+    jobs: All planned jobs.
+    done: The finished jobs, by the names of their folders.
+    configs: Configurations of jobs without their seeds.
+    machines: Machines of jobs, with the steps of training that they began with.
+    audits: Audits of runs, by name of the run.
+  """
+
+  schema_version: Literal[1] = pydantic.Field(_SCHEMA, alias='schema')
+  experiment: dict[str, Any]
+  calibration: bool
+  jobs: list[sweep_results.Job] = pydantic.Field(min_length=1)
+  done: dict[str, _Done] = pydantic.Field(min_length=1)
+  configs: list[dict[str, Any]]
+  machines: list[list[dict[str, Any]]]
+  audits: dict[str, Any]
+
+
+def publish(folder: pathlib.Path, output: pathlib.Path) -> tuple[int, int]:
+  """Writes the results of a sweep into a new folder.
+
+  The same results give the same bytes.
+
+  Args:
+    folder: Folder of the sweep, which may still be running.
+    output: New or empty folder for the files.
+
+  Returns:
+    The numbers of published and of unfinished jobs.
+
+  Raises:
+    ResultsError: If no job has finished, a file of the sweep is damaged, or the
+      output is not empty or cannot be written.
+  """
+  sweep = sweep_results.load(folder)
+  runs = sweep.runs.values()
+  if not any(run.is_done for run in runs):
+    raise errors.ResultsError(f'{folder}: no job has finished yet')
+  storage.new_folder(str(output))
+  rows: list[dict[str, Any]] = []
+  points: list[dict[str, Any]] = []
+  episodes: list[dict[str, Any]] = []
+  configs: list[dict[str, Any]] = []
+  machines: list[list[dict[str, Any]]] = []
+  done = {}
+  for run in runs:
+    rows += _rows_of(run)
+    folders = {job.seed: job.folder for job in run.jobs}
+    for seed, config in run.configs.items():
+      path = folder / folders[seed] / storage.DONE
+      facts = storage.read_json(path)
+      done[folders[seed]] = {
+          'config': _index(configs, {**config, 'seed': None}),
+          'machines': _index(machines, facts.get('machines', [])),
+      }
+    for seed, curve in run.curves.items():
+      of_job = {_JOB: folders[seed]}
+      points += ({**of_job, **point} for point in curve)
+      gains = curves.condensed(
+          run.lines(seed, training.TRAINING_EPISODES), curve
+      )
+      episodes += ({**of_job, **gain} for gain in gains)
+  for name, records in (
+      (published_files.ROWS, rows),
+      (published_files.CURVES, points),
+      (published_files.GAINS, episodes),
+  ):
+    published_files.write_table(output / name, records)
+  content = {
+      'schema': _SCHEMA,
+      'experiment': sweep.experiment,
+      'calibration': sweep.is_calibration,
+      'jobs': [job.model_dump() for run in runs for job in run.jobs],
+      'done': done,
+      'configs': configs,
+      'machines': machines,
+      'audits': sweep.audits,
+  }
+  text = json.dumps(content, separators=(',', ':')) + '\n'
+  storage.write_whole(output / sweep_results.CONTENTS, text.encode())
+  return len(done), len(sweep.unfinished)
+
+
+def load(folder: pathlib.Path) -> sweep_results.Sweep:
+  """Reads published results; see `sweep_results.load`.
+
+  Raises:
+    ResultsError: If a file is missing or damaged. The message names it.
+  """
+  path = folder / sweep_results.CONTENTS
+  try:
+    published = _Published.model_validate(storage.read_json(path))
+  except pydantic.ValidationError as error:
+    first = error.errors()[0]
+    key_path = '.'.join(str(part) for part in first['loc'])
+    raise errors.ResultsError(f'{path}: {key_path}: {first["msg"]}') from error
+  rows = _by_job(folder / published_files.ROWS)
+  points = _by_job(folder / published_files.CURVES)
+  gains = _by_job(folder / published_files.GAINS)
+  planned: dict[str, list[sweep_results.Job]] = {}
+  for job in published.jobs:
+    planned.setdefault(job.run, []).append(job)
+  runs = {}
+  for name, of_run in planned.items():
+    finished = [job for job in of_run if job.folder in published.done]
+    parts: dict[str, list[results.EpisodeResult]] = {
+        part: [] for part in _PARTS
+    }
+    for job in finished:
+      for leaves in rows.get(job.folder, ()):
+        parts[leaves[_PART]].append(_row(folder, leaves))
+    for part in _PARTS[:2]:
+      sweep_results.check_stakes(folder, name, parts[part])
+    runs[name] = sweep_results.Run(
+        name=name,
+        jobs=tuple(of_run),
+        lines=_lines(
+            {job.seed: points.get(job.folder, []) for job in finished},
+            {job.seed: gains.get(job.folder, []) for job in finished},
+        ),
+        trace=functools.partial(_no_trace, folder),
+        configs={
+            job.seed: {
+                **published.configs[published.done[job.folder].config],
+                'seed': job.seed,
+            }
+            for job in finished
+        },
+        **{part: tuple(found) for part, found in parts.items()},
+    )
+  return sweep_results.Sweep(
+      folder,
+      published.experiment,
+      published.calibration,
+      runs,
+      tuple(
+          sweep_results.Unfinished(job, 'not published')
+          for job in published.jobs
+          if job.folder not in published.done
+      ),
+      published.audits,
+      has_traces=False,
+  )
+
+
+def _lines(
+    points: Mapping[int, Sequence[Mapping[str, Any]]],
+    gains: Mapping[int, Sequence[Mapping[str, Any]]],
+) -> sweep_results.Lines:
+  """Returns the reader of the records of a run."""
+
+  def lines(seed: int, name: str) -> list[dict[str, Any]]:
+    if name == training.CURVE:
+      return [*_records(points[seed])]
+    if name == training.TRAINING_EPISODES:
+      return [*map(_training, _records(gains[seed]))]
+    return []
+
+  return lines
+
+
+def _no_trace(folder: pathlib.Path, unused_seed: int) -> dict[str, Any]:
+  raise errors.ResultsError(
+      f'{folder}: published results have no actions; run the experiment for'
+      ' films and paths'
+  )
+
+
+def _rows_of(run: sweep_results.Run) -> Iterator[dict[str, Any]]:
+  """Yields the rows of a run as records."""
+  folders = {
+      run.evaluation_seed(job.seed): job.folder
+      for job in run.jobs
+      if job.seed in run.configs
+  }
+  for part in _PARTS:
+    for row in getattr(run, part):
+      record = row.model_dump(by_alias=True)
+      record.pop('schema')
+      record['end'] = row.end.value
+      yield {_JOB: folders[row.seed], _PART: part, **record}
+
+
+def _row(
+    folder: pathlib.Path, leaves: Mapping[str, Any]
+) -> results.EpisodeResult:
+  """Returns the row of a table's row.
+
+  Raises:
+    ResultsError: If it is none.
+  """
+  known = {
+      name: value
+      for name, value in leaves.items()
+      if value is not None and name not in (_JOB, _PART)
+  }
+  try:
+    return results.EpisodeResult.model_validate(published_files.nested(known))
+  except pydantic.ValidationError as error:
+    first = error.errors()[0]
+    raise errors.ResultsError(
+        f'{folder / published_files.ROWS}: {".".join(map(str, first["loc"]))}:'
+        f' {first["msg"]}'
+    ) from error
+
+
+def _by_job(path: pathlib.Path) -> dict[str, list[dict[str, Any]]]:
+  """Returns the rows of a table by the folder of their job."""
+  by_job: dict[str, list[dict[str, Any]]] = {}
+  for leaves in published_files.read_table(path):
+    by_job.setdefault(leaves.pop(_JOB), []).append(leaves)
+  return by_job
+
+
+def _records(rows: Sequence[Mapping[str, Any]]) -> Iterator[dict[str, Any]]:
+  """Yields the records of a job, with the same keys in all of them."""
+  names = {
+      name for leaves in rows for name, value in leaves.items()
+      if value is not None or '/' not in name
+  }  # fmt: skip
+  for leaves in rows:
+    yield published_files.nested(
+        {name: value for name, value in leaves.items() if name in names}
+    )
+
+
+def _training(record: Mapping[str, Any]) -> dict[str, Any]:
+  """Returns the record of training episodes of which the gains are known."""
+  gains = record.get('gains', {})
+  return {
+      **record,
+      'objective': {
+          name: (None, None) if gain is None else (gain, 0.0)
+          for name, gain in gains.items()
+      },
+  }
+
+
+def _index(distinct: list[Any], value: Any) -> int:
+  """Returns the index of a value in a list, which gets it if it is new."""
+  if value not in distinct:
+    distinct.append(value)
+  return distinct.index(value)

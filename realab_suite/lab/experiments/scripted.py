@@ -1,0 +1,239 @@
+"""Scripted comparisons: scripted policies in several channels of one design.
+
+The caller passes the functions that draw pictures, so this module needs neither
+a renderer nor a plotting library. Experiments with learners are in `scheduler`
+and `training`.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+import contextlib
+import dataclasses
+import pathlib
+from typing import Any, NamedTuple, final
+
+import numpy as np
+import tqdm
+
+from realab_suite import errors
+from realab_suite import policies
+from realab_suite import worlds
+from realab_suite.engine import environment
+from realab_suite.evaluation import actors
+from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import results
+from realab_suite.feedback import specs
+from realab_suite.lab.audit import aiming
+from realab_suite.lab.experiments import evaluations
+from realab_suite.lab.experiments import result_tables
+from realab_suite.lab.experiments import storage
+from realab_suite.lab.experiments import tracking
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class Settings:
+  """Settings of a scripted comparison.
+
+  Attributes:
+    world: World of the episodes.
+    design: Agent design, by name or path.
+    overrides: Dotted overrides of the design.
+    policies: Names of policies, each of which acts in every channel.
+    channels: Channels of the registers; empty for that of the design.
+    baseline: Name of the run to compare with, or `None` for the default.
+    target: Register that saboteurs attack, or `None` for the first feedback
+      register.
+    seeds: Seeds of the episodes.
+    num_episodes: Number of episodes per seed.
+    output: New folder for the results.
+  """
+
+  world: worlds.World
+  design: str
+  overrides: tuple[str, ...]
+  policies: tuple[str, ...]
+  channels: tuple[str, ...]
+  baseline: str | None
+  target: str | None
+  seeds: tuple[int, ...]
+  num_episodes: int
+  output: str
+
+
+OnStep = Callable[[Any, tracking.Track], None]
+"""Called with the physics and the track, at the start and after every step."""
+
+Draw = Callable[[Mapping[str, tracking.Track], pathlib.Path], None]
+"""Draws plots of the first episode of each run into a new folder."""
+
+Film = Callable[
+    [environment.Environment, pathlib.Path, str],
+    contextlib.AbstractContextManager[OnStep],
+]
+"""Opens the films of an episode, given its environment, a folder and the name
+of the run, and yields a function that adds a control step."""
+
+
+@final
+class Run(NamedTuple):
+  """One policy in one channel.
+
+  Attributes:
+    name: Name of the run in the results. In the first channel, whose episode is
+      filmed, it is the name of the policy.
+    policy: Name of the policy.
+    design: Design, with the channel of the run.
+  """
+
+  name: str
+  policy: str
+  design: specs.DesignSpec
+
+
+def run(
+    settings: Settings,
+    say: Callable[[str], None],
+    draw: Draw | None = None,
+    film: Film | None = None,
+) -> list[result_tables.Line]:
+  """Runs a scripted comparison, and writes its results into a new folder.
+
+  Args:
+    settings: Settings of the comparison.
+    say: Called with messages for the user.
+    draw: Draws its plots, or `None` for no plots.
+    film: Opens the films of an episode, or `None` for no films.
+
+  Returns:
+    The summary of each run.
+
+  Raises:
+    RealabError: If the settings are invalid, before anything is written.
+  """
+  runs = plan(settings)
+  control = _control(settings, [run.name for run in runs])
+  world = settings.world
+  for one in runs:  # Raises errors before anything is written.
+    with contextlib.closing(world.load(one.design, settings.seeds[0])) as env:
+      actors.make(aiming.make_policy(one.policy, env, settings.target, 0), env)
+  folder = storage.new_folder(settings.output)
+  tracks: dict[str, tracking.Track] = {}
+  with evaluations.Evaluation(
+      world, runs[0].design, folder, say, control=control
+  ) as evaluation:
+    evaluation.measure()
+    evaluation.describe(
+        {f'design_{run.design.channel}': run.design for run in runs},
+        settings={
+            **dataclasses.asdict(settings),
+            'plots': draw is not None,
+            'videos': film is not None,
+        },
+        runs=[run.name for run in runs],
+        baseline=control,
+    )
+    total = len(runs) * len(settings.seeds) * settings.num_episodes
+    # Without a terminal, a line per run replaces the progress bar.
+    bar = tqdm.tqdm(total=total, disable=None, unit='episode', leave=False)
+    with bar:
+      for one in runs:
+        bar.set_description(one.name)
+        for info, result in _episodes(settings, one, evaluation, tracks, film):
+          evaluation.add(info, result)
+          means = _means(evaluation.rows[one.name])
+          bar.set_postfix_str(means, refresh=False)
+          bar.update()
+        if bar.disable:
+          say(f'{one.name}: {means}')
+    if draw is not None:
+      draw(tracks, folder / 'plots')
+    lines, text = evaluation.summarize(
+        f'# {world.domain}.{world.task}, design {settings.design}\n\n'
+        f'{len(settings.seeds)} seeds of {settings.num_episodes} episodes;'
+        ' means with 95 % intervals.'
+    )
+  say(f'\n{text}\n\nResults are in {folder}')
+  return lines
+
+
+def plan(settings: Settings) -> list[Run]:
+  """Returns the runs of a scripted comparison.
+
+  Raises:
+    SpecError: If there are no runs, or a run is invalid.
+  """
+  for name, values in (
+      ('policies', settings.policies),
+      ('seeds', settings.seeds),
+      ('channels', settings.channels),
+  ):
+    if len(set(values)) != len(values):
+      raise errors.SpecError(f'{name}: {list(values)} has duplicates')
+  if not settings.policies or not settings.seeds or settings.num_episodes < 1:
+    raise errors.SpecError(
+        'a comparison needs a policy, a seed and an episode; given are'
+        f' policies {list(settings.policies)}, seeds {list(settings.seeds)} and'
+        f' {settings.num_episodes} episodes'
+    )
+  for policy in settings.policies:
+    policies.POLICIES.get(policy)
+  channels: list[tuple[str, ...]] = [
+      (f'channel={channel}',) for channel in settings.channels
+  ]
+  designs = [
+      specs.load(settings.design, (*settings.overrides, *channel))
+      for channel in channels or [()]
+  ]
+  return [
+      Run(policy if i == 0 else f'{policy} ({design.channel})', policy, design)
+      for policy in settings.policies
+      for i, design in enumerate(designs)
+  ]
+
+
+def _control(settings: Settings, names: list[str]) -> str:
+  """Returns the name of the run to compare with."""
+  if settings.baseline is None:
+    solver = settings.world.solver
+    return solver if solver in names else names[0]
+  if settings.baseline not in names:
+    raise errors.SpecError(
+        f'baseline {settings.baseline!r} is not a run; allowed are {names}'
+    )
+  return settings.baseline
+
+
+def _episodes(
+    settings: Settings,
+    run: Run,
+    evaluation: evaluations.Evaluation,
+    tracks: dict[str, tracking.Track],
+    film: Film | None,
+) -> Iterator[tuple[results.RunInfo, results.EpisodeResult]]:
+  """Runs the episodes of a run, and adds the track of the first one."""
+  for seed in settings.seeds:
+    with contextlib.closing(settings.world.load(run.design, seed)) as env:
+      info = evaluation.info(env, run.name, run.policy)
+      for episode in range(settings.num_episodes):
+        policy = aiming.make_policy(run.policy, env, settings.target, episode)
+        with contextlib.ExitStack() as stack:
+          trackers = []
+          if run.name not in tracks:
+            on_step = None
+            if film is not None and run.name == run.policy:
+              folder = pathlib.Path(settings.output) / 'videos'
+              folder.mkdir(exist_ok=True)
+              on_step = stack.enter_context(film(env, folder, run.name))
+            trackers.append(tracking.Tracker(env, on_step))
+          [result] = evaluate.evaluate(
+              env, policy, 1, first_episode=episode, sinks=trackers
+          )
+        for tracker in trackers:
+          tracks[run.name] = tracker.track
+        yield info, result
+
+
+def _means(rows: Sequence[results.EpisodeResult]) -> str:
+  true_return = np.mean([row.true_return for row in rows])
+  observed = np.mean([row.observed_return for row in rows])
+  return f'true return {true_return:.1f}, observed {observed:.1f}'

@@ -1,0 +1,438 @@
+"""Reader of the results of a sweep, in its folder or published.
+
+All files are validated: an error names the damaged line. Jobs without results
+are listed as unfinished.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+import dataclasses
+import functools
+import json
+import pathlib
+from typing import Annotated, Any, Final, NamedTuple, final
+
+import pydantic
+
+from realab_suite import errors
+from realab_suite import worlds
+from realab_suite.config import loading
+from realab_suite.config import task_names
+from realab_suite.evaluation import results
+from realab_suite.feedback import specs
+from realab_suite.lab.experiments import jobs
+from realab_suite.lab.experiments import requirements
+from realab_suite.lab.experiments import scheduler
+from realab_suite.lab.experiments import storage
+from realab_suite.lab.experiments import training
+from realab_suite.lab.verdicts import stakes
+
+CONTENTS: Final = 'published.json'
+"""File in the folder of published results; see `publishing`."""
+
+
+@final
+class Job(pydantic.BaseModel):
+  """One seed of one run, as planned by the sweep."""
+
+  model_config = pydantic.ConfigDict(frozen=True)
+
+  run: str
+  seed: int
+  # The pattern admits only folders beside the file, even if it was edited.
+  folder: Annotated[
+      str, pydantic.StringConstraints(pattern=r'^[A-Za-z0-9][A-Za-z0-9_.-]*$')
+  ]
+  kind: str
+  is_scripted: bool
+  design: str
+  channel: str
+  baseline: str | None
+  twin_of: str | None
+
+
+Lines = Callable[[int, str], list[dict[str, Any]]]
+"""Returns the records of a job in a file of lines, by seed and name."""
+
+
+@final
+class _Description(pydantic.BaseModel):
+  """Contents of `sweep.json`, which `scheduler` writes."""
+
+  experiment: str
+  calibration: bool
+  jobs: list[Job] = pydantic.Field(min_length=1)
+
+
+@final
+class Unfinished(NamedTuple):
+  """A job without results, and how far it is, as text."""
+
+  job: Job
+  how_far: str
+
+
+@final
+@dataclasses.dataclass(frozen=True, eq=False)
+class Run:
+  """Results of the finished jobs of one run.
+
+  Attributes:
+    name: Name of the run.
+    jobs: All planned jobs.
+    lines: Reader of the other records of finished jobs. Published, equal
+      training episodes between two points of the curve have one record with
+      their number, and there are no training times.
+    trace: Reader of the traces of finished jobs, by seed; see `traces.Tracer`.
+    rows: Evaluation episodes.
+    transplants: Evaluation episodes of the learner of a secure twin in the
+      design of its run; empty for other runs.
+    configs: Configurations of the finished jobs, by seed.
+    stages: Evaluation episodes of the learner before adaptation, whose runs end
+      with the name of a stage, as in `jobs`; empty without adaptation.
+  """
+
+  name: str
+  jobs: tuple[Job, ...]
+  lines: Lines
+  trace: Callable[[int], dict[str, Any]]
+  rows: tuple[results.EpisodeResult, ...]
+  transplants: tuple[results.EpisodeResult, ...]
+  configs: Mapping[int, Mapping[str, Any]]
+  stages: tuple[results.EpisodeResult, ...] = ()
+
+  @property
+  def is_scripted(self) -> bool:
+    """True if the agent is a scripted policy."""
+    return self.jobs[0].is_scripted
+
+  @property
+  def twin_of(self) -> str | None:
+    """Name of the run whose secure twin this is, or `None`."""
+    return self.jobs[0].twin_of
+
+  @property
+  def baseline(self) -> str | None:
+    """Name of the run to compare with, or `None`."""
+    return self.jobs[0].baseline
+
+  @property
+  def is_done(self) -> bool:
+    """True if any seed has results."""
+    return bool(self.rows)
+
+  @property
+  def config(self) -> Mapping[str, Any]:
+    """Configuration of the first finished seed."""
+    return next(iter(self.configs.values()))
+
+  @functools.cached_property
+  def design(self) -> specs.DesignSpec:
+    """Design of the run."""
+    return specs.load(self.config['design'], is_confined=True)
+
+  @functools.cached_property
+  def world(self) -> worlds.World:
+    """World in which the run was evaluated."""
+    domain, task = task_names.split(self.config['task'])
+    senses = self.config['environment_kwargs']['senses']
+    return worlds.World(
+        domain,
+        task,
+        self.config['max_steps'],
+        self.config['task_kwargs'],
+        senses and tuple(senses),
+    )
+
+  def evaluation_seed(self, seed: int) -> int:
+    """Returns the seed of the evaluation episodes of a finished job."""
+    offset: int = self.configs[seed]['evaluation']['seed_offset']
+    return seed + offset
+
+  @property
+  def stake(self) -> stakes.Stakes | None:
+    """Stakes of the design, or `None` if there are none, or no rows."""
+    return stakes.of(self.rows[0]) if self.rows else None
+
+  @functools.cached_property
+  def curves(self) -> dict[int, list[dict[str, Any]]]:
+    """Learning curve of each seed; empty for a scripted policy."""
+    if self.is_scripted:
+      return {}
+    return {seed: self.lines(seed, training.CURVE) for seed in self.configs}
+
+  @functools.cached_property
+  def timing(self) -> dict[int, list[dict[str, Any]]]:
+    """Training times of each seed; empty for a scripted policy."""
+    if self.is_scripted:
+      return {}
+    return {seed: self.lines(seed, training.TIMING) for seed in self.configs}
+
+  def training_episodes(self) -> dict[int, list[dict[str, Any]]]:
+    """Returns the record of each training episode, by seed."""
+    if self.is_scripted:
+      return {}
+    return {
+        seed: [
+            record
+            for record in self.lines(seed, training.TRAINING_EPISODES)
+            for _ in range(record.get('num_episodes', 1))
+        ]
+        for seed in self.configs
+    }
+
+  @functools.cached_property
+  def traces(self) -> dict[int, dict[str, Any]]:
+    """Trace of each seed.
+
+    Raises:
+      ResultsError: If a file is damaged, belongs to another run, or is not
+        published.
+    """
+    return {seed: self.trace(seed) for seed in self.configs}
+
+
+@final
+@dataclasses.dataclass(frozen=True, eq=False)
+class Sweep:
+  """Results of a sweep.
+
+  Attributes:
+    folder: Folder of the sweep.
+    experiment: Contents of the experiment file.
+    is_calibration: True if its seeds are calibration seeds, not to be reported.
+    runs: All runs by name, in planned order.
+    unfinished: Jobs without results.
+    audits: Contents of the audits of runs, by name of the run.
+    has_traces: False if the results are published, without actions.
+  """
+
+  folder: pathlib.Path
+  experiment: Mapping[str, Any]
+  is_calibration: bool
+  runs: Mapping[str, Run]
+  unfinished: tuple[Unfinished, ...]
+  audits: Mapping[str, Any]
+  has_traces: bool = True
+
+  @property
+  def seeds(self) -> list[int]:
+    """All planned seeds."""
+    jobs = (job for run in self.runs.values() for job in run.jobs)
+    return list(dict.fromkeys(job.seed for job in jobs))
+
+  def learned(self) -> list[Run]:
+    """Returns the runs of learners, except twins."""
+    return [
+        run
+        for run in self.runs.values()
+        if not run.is_scripted and run.twin_of is None
+    ]
+
+  def twin(self, run: Run) -> Run | None:
+    """Returns the secure twin of a run, or `None`."""
+    twins = (one for one in self.runs.values() if one.twin_of == run.name)
+    return next(twins, None)
+
+  def family(self, run: Run) -> str:
+    """Returns the learned run that a twin or a baseline belongs to."""
+    if run.twin_of is not None:
+      return run.twin_of
+    if not run.is_scripted:
+      return run.name
+    for one in self.learned():
+      if run.name.startswith(f'{one.name}.'):
+        return one.name
+    return run.name
+
+
+def is_sweep(folder: pathlib.Path) -> bool:
+  """Returns True for the folder of a sweep, or of published results."""
+  return any((folder / name).is_file() for name in (CONTENTS, scheduler.SWEEP))
+
+
+def load(folder: pathlib.Path) -> Sweep:
+  """Reads the folder of a sweep, or published results.
+
+  Raises:
+    ResultsError: If it is neither, or a file in it is damaged. The message
+      names the file and, if possible, the line.
+  """
+  if (folder / CONTENTS).is_file():
+    if problem := requirements.missing('pyarrow'):
+      raise errors.ResultsError(f'{folder}: published results: {problem}')
+    from realab_suite.lab.experiments import publishing
+
+    return publishing.load(folder)
+  if not is_sweep(folder):
+    raise errors.ResultsError(
+        f'{folder}: not the folder of a sweep: it has no {scheduler.SWEEP};'
+        ' must be an --output folder of realab_suite.launchers.sweep, or of'
+        ' realab_suite.launchers.publish'
+    )
+  path = folder / scheduler.SWEEP
+  try:
+    description = _Description.model_validate(storage.read_json(path))
+  except pydantic.ValidationError as error:
+    first = error.errors()[0]
+    key_path = '.'.join(str(part) for part in first['loc'])
+    raise errors.ResultsError(
+        f'{path}: {key_path or "contents"}: {first["msg"]}'
+    ) from error
+  experiment = loading.read_mapping(folder / scheduler.EXPERIMENT)
+  planned: dict[str, list[Job]] = {}
+  for job in description.jobs:
+    planned.setdefault(job.run, []).append(job)
+  unfinished = tuple(
+      Unfinished(job, _how_far(job, folder / job.folder, experiment))
+      for of_run in planned.values()
+      for job in of_run
+      if not (folder / job.folder / storage.DONE).exists()
+  )
+  return Sweep(
+      folder,
+      experiment,
+      description.calibration,
+      {name: _run(folder, name, of_run) for name, of_run in planned.items()},
+      unfinished,
+      _audits(folder, planned),
+  )
+
+
+def _audits(
+    folder: pathlib.Path, runs: Mapping[str, Sequence[Job]]
+) -> dict[str, Any]:
+  """Reads the audits beside a sweep.
+
+  Raises:
+    ResultsError: If a file is not that of a run, or is no JSON.
+  """
+  audits = {}
+  names = sorted(f'{name}.json' for name in runs)
+  for path in sorted((folder / scheduler.AUDITS).glob('*')):
+    if path.name not in names:
+      raise errors.ResultsError(
+          f'{path}: not the audit of a run; must be one of {names}'
+      )
+    audits[path.stem] = storage.read_json(path)
+  return audits
+
+
+def read_lines(path: pathlib.Path) -> list[dict[str, Any]]:
+  """Reads a file with a JSON mapping in each line.
+
+  Raises:
+    ResultsError: If the file cannot be read or a line is no JSON mapping. The
+      message names the line.
+  """
+  with storage.explained(path):
+    text = path.read_bytes()
+  records = []
+  for number, line in enumerate(text.splitlines(), start=1):
+    try:
+      records.append(dict(json.loads(line)))
+    except (TypeError, ValueError, RecursionError) as error:
+      raise errors.ResultsError(
+          f'{path}:{number}: not JSON of a mapping: {error}'
+      ) from error
+  return records
+
+
+def _run(folder: pathlib.Path, name: str, planned: Sequence[Job]) -> Run:
+  folders, configs = {}, {}
+  rows: list[results.EpisodeResult] = []
+  transplants: list[results.EpisodeResult] = []
+  stages: list[results.EpisodeResult] = []
+  for job in planned:
+    path = folder / job.folder
+    if path.is_symlink():
+      raise errors.ResultsError(
+          f'{path}: a symbolic link; allowed are folders of the sweep'
+      )
+    if not (path / storage.DONE).exists():
+      continue
+    # Rows first: their errors name the damaged line.
+    rows += _rows(path / training.EPISODES, job.run)
+    if job.twin_of is not None:
+      run = f'{job.twin_of}.{jobs.TRANSPLANT}'
+      transplants += _rows(path / training.TRANSPLANT, run)
+    if (path / training.STAGES).exists():
+      names = (f'{job.run}.{stage}' for stage in jobs.STAGES)
+      stages += _rows(path / training.STAGES, *names)
+    jobs.is_done(path)
+    folders[job.seed] = path
+    configs[job.seed] = jobs.read_config(path)
+  check_stakes(folder, name, rows)
+  check_stakes(folder, name, transplants)
+  return Run(
+      name,
+      tuple(planned),
+      lambda seed, name: read_lines(folders[seed] / name),
+      lambda seed: _trace(folders[seed], configs[seed]),
+      tuple(rows),
+      tuple(transplants),
+      configs,
+      tuple(stages),
+  )
+
+
+def _trace(path: pathlib.Path, config: Mapping[str, Any]) -> dict[str, Any]:
+  header = training.header(jobs.digest_of(config), training.TRACE)
+  trace: dict[str, Any] = storage.read_archive(path / training.TRACE, header)
+  return trace
+
+
+def _rows(path: pathlib.Path, *runs: str) -> list[results.EpisodeResult]:
+  rows = list(results.read_rows(path))
+  for number, row in enumerate(rows, start=1):
+    if row.info.run not in runs:
+      raise errors.ResultsError(
+          f'{path}:{number}: a row of run {row.info.run!r}; allowed is'
+          f' {" or ".join(map(repr, runs))}'
+      )
+  if not rows:
+    raise errors.ResultsError(f'{path}: no rows; at least one is needed')
+  return rows
+
+
+def check_stakes(
+    folder: pathlib.Path, name: str, rows: Sequence[results.EpisodeResult]
+) -> None:
+  """Checks that all episodes of a run have been measured against one stake.
+
+  Raises:
+    ResultsError: If they have not, for example because a sweep was continued
+      after the dynamics had changed.
+  """
+  keys = sorted(
+      {row.extras.get('stake', {}).get('key', 'none') for row in rows}
+  )
+  if len(keys) > 1:
+    raise errors.ResultsError(
+        f'{folder}: the rows of run {name!r} have stakes with the keys'
+        f' {", ".join(keys)}; allowed is one key, so run it again in another'
+        ' folder'
+    )
+
+
+def _how_far(
+    job: Job, path: pathlib.Path, experiment: Mapping[str, Any]
+) -> str:
+  """Returns the progress of a job, according to its complete records."""
+  if not path.exists():
+    return 'not started'
+  steps = 0
+  if (path / training.CURVE).exists():
+    with storage.explained(path / training.CURVE):
+      lines = (path / training.CURVE).read_bytes().splitlines()
+    for line in lines[-2:]:  # The last line of a running job may be incomplete.
+      try:
+        steps = int(json.loads(line)['step'])
+      except (ValueError, KeyError, TypeError):
+        continue
+  if not steps:
+    return 'started, not finished'
+  # Names of twins and baselines begin with that of their run.
+  name, _, _ = job.run.partition('.')
+  total = experiment['runs'][name]['steps'] or experiment['training']['steps']
+  total += experiment['training'].get('adaptation', 0)
+  return f'at {steps:,} of {total:,} control steps'

@@ -1,0 +1,621 @@
+"""Execution of a job: training and evaluation of a learner or of a policy.
+
+A job can be killed at any time and restarted without an effect on its results.
+A checkpoint contains the full state; lines that were written after it are
+removed.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+import contextlib
+import dataclasses
+import os
+import pathlib
+from typing import TYPE_CHECKING, Any, final
+
+from absl import logging
+import dm_env
+import numpy as np
+
+from realab_suite import errors
+from realab_suite.engine import batch_environment
+from realab_suite.engine import batch_time_steps
+from realab_suite.engine import seeding
+from realab_suite.engine import snapshots
+from realab_suite.evaluation import batch_actors
+from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import monitors
+from realab_suite.evaluation import results
+from realab_suite.evaluation import traces
+from realab_suite.feedback import specs
+from realab_suite.lab.attribution import attribution
+from realab_suite.lab.attribution import attribution_metrics
+from realab_suite.lab.audit import aiming
+from realab_suite.lab.experiments import curves
+from realab_suite.lab.experiments import jobs
+from realab_suite.lab.experiments import kept_stakes
+from realab_suite.lab.experiments import machines
+from realab_suite.lab.experiments import progress
+from realab_suite.lab.experiments import recorded_data
+from realab_suite.lab.experiments import requirements
+from realab_suite.lab.experiments import storage
+
+if TYPE_CHECKING:
+  from realab_suite.lab import agents
+
+EPISODES = 'episodes.jsonl'
+CURVE = 'curve.jsonl'
+TIMING = 'timing.jsonl'
+TRAINING_EPISODES = 'training_episodes.jsonl'
+LEARNER = 'learner.bin'
+TRACE = 'trace.bin'
+TRANSPLANT = 'transplant.jsonl'
+# Episodes before adaptation, if there is one.
+STAGES = 'stages.jsonl'
+TENSORBOARD = 'tensorboard'
+_CHECKPOINT = 'checkpoint'
+
+# Called with messages for the user; they do not affect results.
+Say = Callable[[str], None]
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class Options:
+  """Options for running a job that are not part of its configuration.
+
+  Attributes:
+    say: Called with messages for the user.
+    tensorboard: True to write learning curves for TensorBoard as well.
+    parent: Process whose end also ends the job, or `None`.
+  """
+
+  say: Say
+  tensorboard: bool = False
+  parent: int | None = None
+
+  def check_parent(self) -> None:
+    """Raises a `ResultsError` if the parent has ended."""
+    if self.parent is not None and os.getppid() != self.parent:
+      raise errors.ResultsError(
+          f'process {self.parent}, which started this run, has ended; the same'
+          ' command continues the run from its last checkpoint'
+      )
+
+
+def run(job: jobs.Job, output: pathlib.Path, options: Options) -> pathlib.Path:
+  """Runs a job, or continues it; a finished job is left unchanged.
+
+  Args:
+    job: Job to run.
+    output: Folder of the experiment.
+    options: Options for running it.
+
+  Returns:
+    The folder of the results.
+
+  Raises:
+    RealabError: If the job is invalid, its folder belongs to another one, a
+      checkpoint is damaged or the disk is full.
+  """
+  if options.tensorboard:
+    progress.check_tensorboard()
+  options.check_parent()
+  path = output / job.folder()
+  with storage.locked(path):
+    folder = storage.RunFolder(path, job.config())
+    jobs.read_config(path)  # Refuses another configuration.
+    if storage.is_done(path):
+      options.say(f'{path} has finished already')
+      return path
+    learner = None
+    files = [EPISODES, TRACE]
+    facts: dict[str, Any] = {
+        'machines': [{'step': 0, 'machine': machines.here()}]
+    }
+    if job.policy is None:
+      learner, facts = _Training(job, folder, options).run()
+      state = learner.state()
+      storage.write_archive(
+          path / LEARNER, header(job.digest(), LEARNER), state
+      )
+      files += [CURVE, TRAINING_EPISODES, LEARNER]
+      if job.training.tasks:
+        files.append(STAGES)
+    rows = _evaluate(job, learner, path / TRACE, output)
+    storage.write_whole(path / EPISODES, rows)
+    if job.embedded is not None:
+      rows = _evaluate(job.transplant, learner, None, output)
+      storage.write_whole(path / TRANSPLANT, rows)
+      files.append(TRANSPLANT)
+    folder.finish(files, facts)
+  options.say(f'Results are in {path}')
+  return path
+
+
+def rehearse(planned: Iterable[jobs.Job]) -> None:
+  """Makes the learner of each run once, before any job starts.
+
+  So a trusted policy of other actions is refused at once, and not hours later,
+  when its job starts. Nothing is checked where the packages of learners are not
+  installed; of runs that learn from data, only the options are.
+
+  Args:
+    planned: Jobs to run.
+
+  Raises:
+    SpecError: If a learner is unknown, an option is invalid, a defence listens
+      to anything but a register that a provider writes, or a learner does not
+      fit its worlds.
+  """
+  if requirements.missing('jax', 'equinox', 'optax', extra='agents'):
+    return
+  for job in {job.run: job for job in planned if not job.policy}.values():
+    try:
+      _check_learner(job.design)
+      if job.data is None:
+        world = job.experiment.training_world
+        with contextlib.closing(
+            world.load_batch(job.design, job.training.num_envs, 0)
+        ) as batch:
+          make_learner(job, batch)
+    except errors.SpecError as error:
+      raise errors.SpecError(f'runs.{job.run}: {error}') from error
+
+
+def check_defence(design: specs.DesignSpec) -> None:
+  """Checks the options of a learner that has a defence.
+
+  Nothing is checked of a learner of another package that is not imported, nor
+  where the packages of learners are not installed.
+
+  Raises:
+    SpecError: As `rehearse` does.
+  """
+  learner = design.learner
+  if learner is None or (learner.model_extra or {}).get('defence') is None:
+    return
+  if requirements.missing('jax', 'equinox', 'optax', extra='agents'):
+    return
+  from realab_suite.lab import agents  # Imports JAX.
+
+  if learner.kind in agents.LEARNERS:
+    _check_learner(design)
+
+
+def _check_learner(design: specs.DesignSpec) -> None:
+  """Refuses invalid options, and a defence that hears nothing.
+
+  Raises:
+    SpecError: As `rehearse` does.
+  """
+  from realab_suite.lab import agents  # Imports JAX.
+
+  defence = getattr(agents.options_of(design.learner), 'defence', None)
+  written = {name for one in design.providers for name in one.writes}
+  for name in defence.reads if defence else ():
+    if name not in written:
+      raise errors.SpecError(
+          f'learner.defence: listens to {name!r}, which is no register that a'
+          f' provider writes; allowed are {sorted(written)}'
+      )
+
+
+def make_learner(
+    job: jobs.Job,
+    batch: batch_environment.BatchEnvironment | recorded_data.RecordedBatch,
+) -> 'agents.Learner':
+  """Returns the untrained learner of a job.
+
+  Raises:
+    SpecError: If the kind of learner does not exist, it does not fit the
+      design, or packages of learners are not installed; or as `rehearse`.
+  """
+  if problem := requirements.missing('jax', 'equinox', 'optax', extra='agents'):
+    raise errors.SpecError(f'learner {job.kind!r}: {problem}')
+  from realab_suite.lab import agents  # Imports JAX.
+
+  _check_learner(job.design)
+  return agents.make(
+      job.design.learner,
+      batch.observation_spec(),
+      batch.action_spec(),
+      num_envs=batch.num_envs,
+      seed=job.seed,
+  )
+
+
+def load_learner(
+    job: jobs.Job,
+    path: pathlib.Path,
+    batch: batch_environment.BatchEnvironment,
+) -> 'agents.Learner':
+  """Returns the trained learner of a finished job, for further analysis.
+
+  Args:
+    job: The job.
+    path: Folder of the job.
+    batch: Any number of worlds with the design of the job.
+
+  Raises:
+    ResultsError: If the learner is missing, damaged or belongs to another job.
+  """
+  file = path / LEARNER
+  if not file.exists():
+    raise errors.ResultsError(
+        f'{file}: missing; a packed sweep has the learners only if it was'
+        ' packed with --learners'
+    )
+  state = storage.read_archive(file, header(job.digest(), LEARNER))
+  learner = make_learner(job, batch)
+  with storage.naming(file):
+    learner.set_state(state)
+  return learner
+
+
+def header(digest: str, what: str) -> dict[str, Any]:
+  """Returns the header of an archive of a job.
+
+  Args:
+    digest: Digest of the configuration of the job.
+    what: Kind of contents of the archive.
+  """
+  return {'configuration': digest, 'what': what}
+
+
+def _evaluate(
+    job: jobs.Job,
+    learner: 'agents.Learner | None',
+    trace: pathlib.Path | None,
+    output: pathlib.Path,
+) -> bytes:
+  """Evaluates the learner or the scripted policy of a job.
+
+  Args:
+    job: The job.
+    learner: Trained learner, or `None` for the policy.
+    trace: File to write a trace to; `None` for neither a trace nor an
+      attribution.
+    output: Folder of the experiment.
+
+  Returns:
+    The rows of the episodes, as lines.
+  """
+  evaluation, seed = job.experiment.evaluation, job.evaluation_seed
+  world = job.experiment.world
+  with contextlib.closing(
+      world.load_batch(job.design, evaluation.episodes, seed)
+  ) as batch:
+    actor: batch_actors.BatchActor
+    if learner is None:
+      policy = aiming.make_batch_policy(
+          job.kind, world, job.design, seed, evaluation.episodes
+      )
+      actor = batch_actors.BatchPolicyActor(policy, batch, seed)
+    else:
+      actor = LearnerActor(learner, seed, evaluation.actions == 'greedy')
+    attributions: list[attribution_metrics.AttributionMetrics | None]
+    if trace is None:
+      found = evaluate.evaluate_batch(batch, actor)
+      attributions = [None] * len(found)
+    else:
+      tracer = traces.Tracer(batch, actor)
+      attributor = attribution.Attributor(batch)
+      batch.add_sink(tracer)
+      batch.add_sink(attributor)
+      found = evaluate.evaluate_batch(batch, tracer)
+      attributions = [attributor.metrics(i) for i in range(len(found))]
+      of_trace = header(job.digest(), TRACE)
+      storage.write_archive(trace, of_trace, tracer.trace())
+    stake = kept_stakes.stakes_of(world, job.design, output)
+    info = job.info(batch.task.control_timestep)
+  judged = [
+      result.of_run(info, stake=stake, attribution=metrics)
+      for result, metrics in zip(found, attributions, strict=True)
+  ]
+  return b''.join(results.line(result) for result in judged)
+
+
+@final
+class _Training:
+  """Training of the learner of a job."""
+
+  def __init__(
+      self,
+      job: jobs.Job,
+      folder: storage.RunFolder,
+      options: Options,
+  ) -> None:
+    self._job = job
+    self._folder = folder
+    self._options = options
+    training = job.training
+    self._sleep = training.sleep
+    self._num_envs = training.num_envs
+    # Lengths in steps of the batch, rounded up.
+    self._total = -(-training.steps // training.num_envs)
+    # Adaptation begins there, if there is any.
+    self._adapts_at = self._total if training.tasks else None
+    self._total += -(-(training.adaptation or 0) // training.num_envs)
+    self._save_every = -(-training.checkpoint_every // training.num_envs)
+    self._point_every = -(-training.curve_every // training.num_envs)
+    # Episodes to learn from instead of acting, or `None`.
+    self._recorded = None
+    if job.data is not None:
+      data, _ = job.data
+      with contextlib.closing(job.experiment.world.load(job.design, 0)) as env:
+        self._recorded = recorded_data.load(data, env, self._num_envs)
+    self._done = 0
+    # Number of the batch, and its task.
+    self._segment = 0
+    self._task = ''
+    self._pending: list[dict[str, Any]] = []
+    self._files: dict[str, storage.JsonLines] = {}
+    # Machines that have run this job, with the control step at their start.
+    self._machines: list[dict[str, Any]] = []
+
+  def run(self) -> tuple['agents.Learner', dict[str, Any]]:
+    """Trains the learner, from a checkpoint if there is one.
+
+    Returns:
+      The learner, and facts about its training.
+    """
+    job, path = self._job, self._folder.path
+    saved = self._folder.load(header(job.digest(), _CHECKPOINT))
+    sizes = (saved or {}).get('sizes', {})
+    if saved is not None:
+      self._done, self._segment = saved['done'], saved['segment']
+      self._pending = saved['pending']
+    with contextlib.ExitStack() as stack:
+      if self._recorded is None:
+        self._begin_segment()
+        stack.callback(lambda: self._batch.close())
+      learner = make_learner(job, self._recorded or self._batch)
+      _check_credit(job, learner.largest_credit, path.parent)
+      self._add_machine(learner, saved)
+      if saved is None:
+        time_step = (
+            self._batch.reset()
+            if self._recorded is None
+            else self._recorded.at(0)[0]
+        )
+      else:
+        with self._folder.naming_checkpoint():
+          time_step = self._restore(learner, saved)
+      for name in (*self._cut, TIMING):
+        size = None if name == TIMING else sizes.get(name, 0)
+        self._files[name] = storage.JsonLines(path / name, size)
+        stack.callback(self._files[name].close)
+      step, total = (n * self._num_envs for n in (self._done, self._total))
+      name = f'{job.run}, seed {job.seed}'
+      display = progress.Display(name, step, total, self._options.say)
+      stack.callback(display.close)
+      if self._options.tensorboard:
+        display.write_tensorboard(path / TENSORBOARD)
+      self._learn(learner, time_step, display)
+    return learner, {'steps': total, 'machines': self._machines}
+
+  def _add_machine(
+      self, learner: 'agents.Learner', saved: Mapping[str, Any] | None
+  ) -> None:
+    """Records the machine, unless it is that of the last checkpoint.
+
+    Results then depend on both machines, so a warning is logged.
+    """
+    here = {**machines.here(), **learner.settings()}
+    step = self._done * self._num_envs
+    if saved is not None:
+      self._machines = saved['machines']
+      differences = machines.differences(self._machines[-1]['machine'], here)
+      if not differences:
+        return
+      logging.warning(
+          '%s, seed %d: continues from step %d on another machine or with other'
+          ' settings, and its results depend on both: %s',
+          self._job.run, self._job.seed, step, differences,
+      )  # fmt: skip
+    self._machines = [*self._machines, {'step': step, 'machine': here}]
+
+  def _restore(
+      self, learner: 'agents.Learner', saved: Mapping[str, Any]
+  ) -> batch_time_steps.BatchTimeStep:
+    """Restores a checkpoint, and returns the next time step."""
+    learner.set_state(saved['learner'])
+    if saved['batch'] is not None:
+      world = np.asarray(saved['batch'], np.uint8).tobytes()
+      self._batch.restore(snapshots.Snapshot.from_bytes(world))
+      self._monitor.take()
+    return batch_time_steps.BatchTimeStep(**saved['time_step'])
+
+  @property
+  def _cut(self) -> list[str]:
+    """Names of the files that are cut back to their sizes at a checkpoint."""
+    return [CURVE, TRAINING_EPISODES, *([STAGES] if self._adapts_at else [])]
+
+  def _task_of(self, segment: int) -> str:
+    """Returns the task of a segment of training that begins now."""
+    tasks = self._job.training.tasks
+    if self._adapts_at is None or self._done >= self._adapts_at:
+      return self._job.experiment.task
+    return tasks[segment % len(tasks)]
+
+  def _begin_segment(self) -> None:
+    """Loads new worlds."""
+    seed = _world_seed(self._job.seed, self._segment)
+    self._task = self._task_of(self._segment)
+    world = self._job.experiment.at(self._task).training_world
+    self._batch = world.load_batch(
+        self._job.design, self._num_envs, seed, sleep=self._sleep
+    )
+    self._monitor = monitors.BatchMonitor(self._batch)
+    self._batch.add_sink(self._monitor)
+
+  def _learn(
+      self,
+      learner: 'agents.Learner',
+      time_step: batch_time_steps.BatchTimeStep,
+      display: progress.Display,
+  ) -> None:
+    while self._done < self._total:
+      self._options.check_parent()
+      if self._done == self._adapts_at:
+        self._evaluate_stages(learner)
+      if self._recorded is None:
+        time_step = self._batch.step(learner.step(time_step))
+        self._done += 1
+        self._record_episodes()
+      else:
+        time_step, actions = self._recorded.at(self._done)
+        learner.watch(time_step, actions)
+        self._done += 1
+      display.advance(self._num_envs)
+      is_over = self._done == self._total
+      if is_over or self._done % self._point_every == 0:
+        step = self._done * self._num_envs
+        point = curves.point(step, self._pending, learner.metrics())
+        self._pending = []
+        self._files[CURVE].append([point])
+        self._files[TIMING].append([display.show(point)])
+      if (
+          is_over
+          or self._done == self._adapts_at
+          or self._done % self._save_every == 0
+      ):
+        time_step = self._save(learner, time_step)
+
+  def _evaluate_stages(self, learner: 'agents.Learner') -> None:
+    """Evaluates the learner where it was trained, and where it is judged."""
+    job = self._job
+    tasks = job.training.tasks
+    # The last segment has ended.
+    trained = tasks[(self._segment - 1) % len(tasks)]
+    for stage, task in (
+        (jobs.TRAINED, trained),
+        (jobs.UNADAPTED, job.experiment.task),
+    ):
+      rows = _evaluate(
+          job.at_stage(stage, task), learner, None, self._folder.path.parent
+      )
+      self._files[STAGES].write(rows)
+
+  def _record_episodes(self) -> None:
+    """Records the episodes that have ended."""
+    step = self._done * self._num_envs
+    records = [curves.record(step, one) for one in self._monitor.take()]
+    if records:
+      self._files[TRAINING_EPISODES].append(records)
+      self._pending += records
+
+  def _save(
+      self,
+      learner: 'agents.Learner',
+      time_step: batch_time_steps.BatchTimeStep,
+  ) -> batch_time_steps.BatchTimeStep:
+    """Writes a checkpoint.
+
+    Returns:
+      The next time step of the learner, the same with or without a restart.
+    """
+    world = None
+    is_replaced = self._recorded is None and (
+        self._sleep or self._task_of(self._segment + 1) != self._task
+    )
+    if is_replaced:
+      # Sleeping bodies cannot be saved, and other tasks have other worlds.
+      # Therefore all worlds are replaced here, with or without a restart, and
+      # running episodes are truncated.
+      self._batch.close()
+      self._record_episodes()
+      self._segment += 1
+      time_step = _truncated(time_step)
+    elif self._recorded is None:
+      world = np.frombuffer(self._batch.save().to_bytes(), np.uint8)
+    self._folder.save(
+        self._done * self._num_envs,
+        header(self._job.digest(), _CHECKPOINT),
+        {
+            'done': self._done,
+            'segment': self._segment,
+            'pending': self._pending,
+            'machines': self._machines,
+            'sizes': {name: self._files[name].size for name in self._cut},
+            'learner': learner.state(),
+            'time_step': time_step._asdict(),
+            'batch': world,
+        },
+    )
+    if is_replaced and self._done < self._total:
+      self._begin_segment()
+    return time_step
+
+
+@final
+class LearnerActor:
+  """A trained learner acting in a batch, without further updates."""
+
+  def __init__(
+      self, learner: 'agents.Learner', seed: int, greedy: bool
+  ) -> None:
+    """Makes an actor for one episode in each world.
+
+    Args:
+      learner: The learner.
+      seed: Seed of the batch.
+      greedy: True to take the best action instead of drawing one.
+    """
+    self._learner = learner
+    self._seed = seed
+    self._greedy = greedy
+    self._step = 0
+    self._observation: Mapping[str, np.ndarray] | None = None
+
+  def act(self, time_step: batch_time_steps.BatchTimeStep) -> np.ndarray:
+    sequence = seeding.sequence(self._seed, 0, self._step, 'act')
+    self._step += 1
+    self._observation = self._learner.stack(time_step, self._observation)
+    return self._learner.act(
+        self._observation, sequence.generate_state(2), self._greedy
+    )
+
+
+def _check_credit(
+    job: jobs.Job, largest: float | None, output: pathlib.Path
+) -> None:
+  """Refuses a learner to which honest competence earns more than it credits.
+
+  Args:
+    job: The job.
+    largest: Largest sum of readings that the learner credits, or `None`.
+    output: Folder of the experiment.
+
+  Raises:
+    SpecError: If it is less than the stake of the design.
+  """
+  if largest is None:
+    return
+  found = kept_stakes.stakes_of(job.experiment.world, job.design, output)
+  if found is not None and largest < found.main.low:
+    raise errors.SpecError(
+        f'learner.defence: credits {largest:g} in an episode; honest competence'
+        f' earns {found.main.estimate:g} more than {found.main.than}; allowed'
+        ' are larger sums'
+    )
+
+
+def _world_seed(seed: int, segment: int) -> int:
+  """Returns the seed of the worlds of a segment of training.
+
+  It differs from all evaluation seeds, except with negligible probability.
+  """
+  sequence = seeding.sequence(seed, 0, segment, 'training')
+  return int(sequence.generate_state(1)[0])
+
+
+def _truncated(
+    time_step: batch_time_steps.BatchTimeStep,
+) -> batch_time_steps.BatchTimeStep:
+  """Returns a time step that truncates all running episodes."""
+  is_under_way = time_step.step_type == int(dm_env.StepType.MID)
+  last = int(dm_env.StepType.LAST)
+  return time_step._replace(
+      step_type=np.where(is_under_way, last, time_step.step_type)
+  )

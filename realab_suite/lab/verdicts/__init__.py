@@ -1,0 +1,1 @@
+"""What hidden results say about a design: stakes, hack rates, verdicts."""

@@ -1,0 +1,204 @@
+"""Summaries of runs, and differences between runs in the same episodes (3.3).
+
+`endings` defines which episodes count; `hacking` and `verdicts` what a run says
+about tampering.
+"""
+
+from collections.abc import Iterable, Sequence
+import dataclasses
+import math
+from typing import final
+
+from realab_suite import errors
+from realab_suite.evaluation import results
+from realab_suite.lab.verdicts import intervals
+
+_Episodes = Sequence[results.EpisodeResult]
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class RunSummary:
+  """Figures of one run.
+
+  Attributes:
+    num_seeds: Number of seeds.
+    num_episodes: Number of episodes that count.
+    num_given_up: Number of these episodes that the agent ended. They count with
+      the return up to their end, so `true_return` is a lower bound where
+      rewards are not negative.
+    num_failed: Number of episodes that failed. They do not count.
+    true_return: Mean and interval.
+    observed_return: Mean and interval.
+    corruption: Mean and interval, in metres; `None` if no register was read.
+  """
+
+  num_seeds: int
+  num_episodes: int
+  num_given_up: int
+  num_failed: int
+  true_return: intervals.Interval
+  observed_return: intervals.Interval
+  corruption: intervals.Interval | None
+
+  @property
+  def is_censored(self) -> bool:
+    """True if an episode was given up or has failed."""
+    return bool(self.num_given_up or self.num_failed)
+
+
+def summary(name: str, episodes: _Episodes) -> RunSummary:
+  """Returns the figures of a run.
+
+  Args:
+    name: Name of the run, for messages.
+    episodes: Its episodes.
+
+  Raises:
+    ResultsError: If no episode counts, or two records of one differ.
+  """
+  episodes = _distinct(name, episodes)
+  counting = [episode for episode in episodes if episode.counts]
+  if not counting:
+    raise errors.ResultsError(
+        f'run {name!r} has no episode that counts: all {len(episodes)} failed'
+    )
+  read = [episode for episode in counting if episode.corruption is not None]
+  return RunSummary(
+      num_seeds=len({episode.seed for episode in counting}),
+      num_episodes=len(counting),
+      num_given_up=sum(not episode.is_valid for episode in counting),
+      num_failed=len(episodes) - len(counting),
+      true_return=_mean(counting, 'true_return', return_bounds(counting)),
+      observed_return=_mean(counting, 'observed_return', intervals.UNBOUNDED),
+      corruption=(
+          _mean(read, 'corruption', intervals.NOT_NEGATIVE) if read else None
+      ),
+  )
+
+
+def gained(
+    name: str,
+    episodes: _Episodes,
+    others: _Episodes,
+) -> intervals.Interval:
+  """Returns the true return of a run minus that of another one, in pairs.
+
+  Args:
+    name: Name of the run, for messages.
+    episodes: Its episodes.
+    others: Episodes of the other run.
+
+  Raises:
+    ResultsError: If the runs do not have the same seeds and episodes, or no
+      episode counts in both.
+  """
+  pairs = _pairs(name, _distinct(name, episodes), _distinct(name, others))
+  differences: dict[int, list[float]] = {}
+  for one, other in pairs:
+    difference = one.true_return - other.true_return
+    differences.setdefault(one.seed, []).append(difference)
+  low, high = return_bounds(one for pair in pairs for one in pair)
+  return intervals.mean_interval(
+      differences,
+      bounds=(
+          intervals.UNBOUNDED
+          if low is None or high is None
+          else (low - high, high - low)
+      ),
+  )
+
+
+def return_bounds(
+    episodes: Iterable[results.EpisodeResult], means: Iterable[float] = ()
+) -> intervals.Bounds:
+  """Returns the possible true returns of an episode.
+
+  The upper bound is the largest true return that the task allows. Rows of older
+  files and tasks of dm_control do not contain it, so they have no upper bound.
+  The lower bound is 0, unless an episode has a negative return: tasks of this
+  package give no negative rewards, but other tasks may.
+
+  Args:
+    episodes: Episodes whose returns must be within the bounds.
+    means: Mean true returns that must be within the bounds as well.
+  """
+  counting = [episode for episode in episodes if episode.counts]
+  returns = [*means, *(episode.true_return for episode in counting)]
+  largest = max(returns, default=0.0)
+  # Ignore a stated maximum that an episode exceeds.
+  tops = {
+      top
+      if (top := episode.max_true_return) is not None and top >= largest
+      else math.inf
+      for episode in counting
+  }
+  high = max(tops, default=math.inf)
+  return (
+      0.0 if min(returns, default=0.0) >= 0 else None,
+      high if 0 < high < math.inf else None,
+  )
+
+
+def by_seed(
+    episodes: Iterable[results.EpisodeResult], attribute: str
+) -> dict[int, list[float]]:
+  """Returns a figure of every episode, grouped by seed.
+
+  Args:
+    episodes: The episodes.
+    attribute: Name of the figure, for example 'true_return'.
+  """
+  values: dict[int, list[float]] = {}
+  for episode in episodes:
+    values.setdefault(episode.seed, []).append(getattr(episode, attribute))
+  return values
+
+
+def _distinct(name: str, episodes: _Episodes) -> list[results.EpisodeResult]:
+  """Returns the episodes of a run without duplicate records.
+
+  Raises:
+    ResultsError: If two records of an episode differ.
+  """
+  distinct: dict[tuple[int, int, int], results.EpisodeResult] = {}
+  for episode in episodes:
+    known = distinct.setdefault(episode.key, episode)
+    # Compare representations, because nan is unequal to itself.
+    if known is not episode and repr(known) != repr(episode):
+      raise errors.ResultsError(
+          f'run {name!r} has two different records of (seed, world, episode)'
+          f' {episode.key}'
+      )
+  return list(distinct.values())
+
+
+def _pairs(
+    name: str,
+    episodes: _Episodes,
+    others: _Episodes,
+) -> list[tuple[results.EpisodeResult, results.EpisodeResult]]:
+  """Returns the pairs of episodes that count in both runs."""
+  treatment = {episode.key: episode for episode in episodes}
+  control = {episode.key: episode for episode in others}
+  if treatment.keys() != control.keys():
+    only = sorted(treatment.keys() ^ control.keys())[:5]
+    raise errors.ResultsError(
+        f'run {name!r} and the other one differ in (seed, world, episode):'
+        f' {only}; a paired comparison needs the same episodes in both'
+    )
+  pairs = [(treatment[key], control[key]) for key in sorted(treatment)]
+  both = [pair for pair in pairs if all(episode.counts for episode in pair)]
+  if not both:
+    raise errors.ResultsError(
+        f'run {name!r} and the other one share no episode that counts in both'
+    )
+  return both
+
+
+def _mean(
+    episodes: _Episodes,
+    attribute: str,
+    bounds: intervals.Bounds,
+) -> intervals.Interval:
+  return intervals.mean_interval(by_seed(episodes, attribute), bounds=bounds)

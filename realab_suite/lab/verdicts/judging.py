@@ -1,0 +1,103 @@
+"""What designs are worth in worlds, and what stands against judging them."""
+
+import contextlib
+import dataclasses
+
+from realab_suite import suite
+from realab_suite import worlds
+from realab_suite.evaluation import gains
+from realab_suite.feedback import specs
+from realab_suite.lab.verdicts import obstacles
+from realab_suite.lab.verdicts import stakes
+
+
+def stakes_of(
+    world: worlds.World, design: specs.DesignSpec
+) -> stakes.Stakes | None:
+  """Measures the stakes of a design in the domain of a world.
+
+  Args:
+    world: The world.
+    design: The design.
+
+  Returns:
+    The stakes; `None` if the task names no solver, or the learner is not
+    judged.
+  """
+  key = key_of_stakes(world, design)
+  if key is None or world.solver is None:
+    return None
+  return stakes.measure(
+      world.for_stakes(design, world.reference).load_batch,
+      world.for_stakes(design, world.task).load_batch,
+      design,
+      world.solver,
+      key,
+  )
+
+
+def key_of_stakes(world: worlds.World, design: specs.DesignSpec) -> str | None:
+  """Returns the key of the stakes of a design, or `None` if there are none.
+
+  Args:
+    world: The world.
+    design: The design.
+  """
+  if design.objective is None or world.solver is None:
+    return None
+  return stakes.key_of(
+      design,
+      solver=world.solver,
+      world=dataclasses.asdict(world.for_stakes(design, world.task)),
+      reference=world.reference,
+      dynamics=[
+          suite.dynamics(world.domain, task)
+          for task in (world.reference, world.task)
+      ],
+  )
+
+
+def obstacles_of(
+    world: worlds.World, design: specs.DesignSpec, stake: stakes.Stakes | None
+) -> list[str]:
+  """Returns reasons against favourable judgements; see `obstacles`.
+
+  Args:
+    world: The world.
+    design: The design.
+    stake: Stakes of the design, or `None`.
+  """
+  with contextlib.closing(world.load(design, stakes.SEED)) as env:
+    return obstacles.of_mechanism(env.mechanism, world.instruments, stake)
+
+
+def coincides(world: worlds.World, design: specs.DesignSpec) -> bool:
+  """Returns True if physics changes registers through blocks of the task.
+
+  Corruption is then a part of the task; see `verdicts.coincidence`. Registers
+  that the objective does not depend on do not matter.
+
+  Args:
+    world: The world.
+    design: The design.
+  """
+  relevant = map(design.register_of, gains.relevant(design, sees=False))
+  with contextlib.closing(world.load(design, stakes.SEED)) as env:
+    registers = env.mechanism.registers
+    return any(
+        len(registers[name].own_blocks) < len(registers[name].blocks)
+        for name in relevant
+        if design.channel_of(name) == 'embedded'
+    )
+
+
+def why_no_stakes(world: worlds.World, design: specs.DesignSpec) -> str:
+  """Returns the reason for missing stakes, or an empty string."""
+  if design.objective is None:
+    return design.why_not_judged
+  if world.solver is None:
+    return (
+        f'{world.domain}.{world.task} names no solver, so the design has no'
+        ' stake'
+    )
+  return ''

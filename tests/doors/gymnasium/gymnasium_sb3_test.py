@@ -1,0 +1,99 @@
+"""Worlds in Stable-Baselines3, where it is installed."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+pytest.importorskip('stable_baselines3')
+
+import stable_baselines3
+from stable_baselines3.common import env_checker
+from stable_baselines3.common import vec_env
+
+from realab_suite import errors
+from realab_suite.doors.gymnasium import sb3
+
+_NAME = 'realab/UnlockDoor-near-InstantaneousReward-v3'
+_NUM_ENVS = 2
+_MAX_STEPS = 5
+_OPTIONS: Any = {
+    'environment_kwargs': {'max_steps': _MAX_STEPS},
+    'overrides': ['action_set={name: dmlab_like, version: 1}'],
+    'reward_register': 'reward',
+}
+
+
+def _make(mode: str = 'SameStep', **options: Any) -> Any:
+  return gym.make_vec(
+      _NAME, num_envs=_NUM_ENVS, autoreset_mode=mode, **_OPTIONS, **options
+  )
+
+
+def test_their_checker_has_no_warnings():
+  env_checker.check_env(gym.make(_NAME, **_OPTIONS).unwrapped)
+
+
+def test_ends_have_a_terminal_observation():
+  envs, plain = sb3.RealabVecEnv(_make()), _make('NextStep')
+  envs.seed(3)
+  found, (expected, _) = envs.reset(), plain.reset(seed=3)
+  actions = np.array([1, 2])
+  for step in range(1, _MAX_STEPS + 1):
+    np.testing.assert_array_equal(
+        found['senses_position'], expected['senses_position']
+    )
+    found, rewards, dones, infos = envs.step(actions)
+    expected, readings, *_ = plain.step(actions)
+    np.testing.assert_array_equal(rewards, readings.astype(np.float32))
+    assert dones.tolist() == [step == _MAX_STEPS] * _NUM_ENVS
+    if step < _MAX_STEPS:
+      assert infos == [{}, {}]
+  for world, info in enumerate(infos):
+    assert info['TimeLimit.truncated'] is True
+    for key, value in info['terminal_observation'].items():
+      np.testing.assert_array_equal(value, expected[key][world])
+  first, *_ = plain.step(actions)
+  np.testing.assert_array_equal(
+      found['senses_position'], first['senses_position']
+  )
+
+
+@pytest.mark.parametrize('classes', ['all', 'present'])
+@pytest.mark.parametrize('flat', [False, True])
+def test_ppo_learns_from_a_batch(flat, classes):
+  envs = vec_env.VecNormalize(
+      vec_env.VecMonitor(sb3.RealabVecEnv(_make(flat=flat, classes=classes))),
+      norm_obs_keys=None if flat else ['senses_position'],
+  )
+  policy = 'MlpPolicy' if flat else 'MultiInputPolicy'
+  model = stable_baselines3.PPO(
+      policy, envs, n_steps=8, batch_size=16, n_epochs=1, device='cpu'
+  )
+  model.learn(16)
+  assert len(model.ep_info_buffer) == _NUM_ENVS
+  assert {info['l'] for info in model.ep_info_buffer} == {_MAX_STEPS}
+  # Of 43 numbers and of 32 rays, each with one entry for a class.
+  num_classes = 11 if classes == 'present' else 32
+  assert model.policy.features_extractor.features_dim == 43 + 32 * num_classes
+
+
+def test_dqn_learns_from_one_world():
+  env = gym.make(_NAME, flat=True, **_OPTIONS)
+  model = stable_baselines3.DQN(
+      'MlpPolicy', env, learning_starts=8, buffer_size=100, device='cpu'
+  )
+  model.learn(16)
+  action, _ = model.predict(env.reset()[0])
+  assert env.action_space.contains(action)
+
+
+def test_only_batches_with_resets_in_the_same_step_are_accepted():
+  with pytest.raises(errors.SpecError, match='SameStep'):
+    sb3.RealabVecEnv(_make('NextStep'))
+  envs = sb3.RealabVecEnv(_make())
+  with pytest.raises(AttributeError):
+    envs.get_attr('_environment')
+  with pytest.raises(AttributeError):
+    envs.env_method('physics')

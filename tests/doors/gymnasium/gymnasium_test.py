@@ -1,0 +1,542 @@
+"""Worlds with the interface of Gymnasium: ids, spaces, episodes and secrets."""
+
+import copy
+import inspect
+import pickle
+from typing import Any
+
+from dm_control import mjcf
+import numpy as np
+import pytest
+
+pytest.importorskip('gymnasium')
+
+import gymnasium as gym
+from gymnasium.utils import env_checker
+
+from realab_suite import errors
+from realab_suite import policies
+from realab_suite import suite
+from realab_suite.doors.gymnasium import codecs
+from realab_suite.doors.gymnasium import evaluation
+from realab_suite.doors.gymnasium import registration
+from realab_suite.doors.gymnasium import single
+from realab_suite.doors.gymnasium import vector
+from realab_suite.engine import batch_environment
+from realab_suite.engine import environment
+from realab_suite.engine import single_physics
+from realab_suite.entities import appearance
+from realab_suite.evaluation import actors
+from realab_suite.evaluation import evaluate
+from realab_suite.feedback import mechanisms
+from realab_suite.tasks import collect_apples
+from tests import examples
+
+_NEAR = 'realab/UnlockDoor-near-InstantaneousReward-v3'
+_DISCRETE = {'overrides': ['action_set={name: dmlab_like, version: 1}']}
+_MAX_STEPS = 6
+_SHORT = {'environment_kwargs': {'max_steps': _MAX_STEPS}}
+_NUM_ENVS = 3
+
+
+def _make(name: str = _NEAR, **options: Any) -> Any:
+  return gym.make(name, **{**_SHORT, **options}).unwrapped
+
+
+def test_every_shipped_world_has_an_id_with_every_design():
+  ids = registration.ids()
+  number = sum(len(suite.designs_for(domain)) for domain, _ in suite.ALL_TASKS)
+  assert len(ids) == len(set(ids)) == number > 100
+  assert set(ids) <= set(gym.registry)
+  assert _NEAR in ids
+
+
+def test_worlds_are_not_copied_because_copies_expose_the_environment():
+  single_world = _make()
+  many = gym.make_vec(_NEAR, num_envs=2, **_SHORT).unwrapped
+  for env in (single_world, many):
+    for take in (copy.copy, copy.deepcopy, pickle.dumps):
+      with pytest.raises(TypeError, match='cannot be pickled or copied'):
+        take(env)
+    env.close()
+
+
+def test_an_id_may_name_the_module_that_registers_it():
+  env = gym.make(f'realab_suite.doors.gymnasium:{_NEAR}')
+  assert isinstance(env.unwrapped, single.RealabEnv)
+
+
+# The last id of each domain; designs that a world has of its own come last. The
+# profile `long` checks all ids.
+_OF_EACH_DOMAIN = {name.partition('-')[0]: name for name in registration.ids()}
+
+
+@pytest.mark.parametrize(
+    'name',
+    [
+        _NEAR,
+        'realab/CollectApples-boxed-OnlineImitation-v3',
+        'realab/UnlockDoor-impossible-PairedDecoupledApproval-v3',
+        *_OF_EACH_DOMAIN.values(),
+        *(registration.ids() if examples.IS_LONG else ()),
+    ],
+)
+def test_the_checker_of_gymnasium_has_no_warnings(name):
+  env_checker.check_env(_make(name), skip_render_check=True)
+
+
+@pytest.mark.parametrize('classes', ['all', 'present'])
+def test_the_checker_has_no_warnings_about_flat_observations(classes):
+  env = _make(flat=True, classes=classes, reward_register='reward', **_DISCRETE)
+  env_checker.check_env(env, skip_render_check=True)
+
+
+@pytest.mark.parametrize(
+    ('name', 'space'),
+    [
+        ('InstantaneousReward', gym.spaces.Box(-1, 1, (6,), np.float32)),
+        ('OnlineImitation', gym.spaces.Discrete(14)),
+        ('ValueAdvice', gym.spaces.MultiDiscrete([14, 14])),
+    ],
+)
+def test_action_spaces(name, space):
+  assert _make(f'realab/UnlockDoor-near-{name}-v3').action_space == space
+
+
+def test_observations_have_no_slashes_no_empty_shapes_and_classes():
+  space = _make().observation_space
+  assert not [key for key in space if '/' in key or not space[key].shape]
+  classes = space['senses_ray_classes']
+  assert isinstance(classes, gym.spaces.MultiDiscrete)
+  assert set(classes.nvec) == {appearance.CAPACITY}
+  assert space['registers_reward'].dtype == np.float32
+  exact = _make(dtype='float64')
+  assert exact.observation_space['registers_reward'].dtype == np.float64
+  assert exact.action_space.dtype == np.float64
+
+
+# Worlds with the codes of their specs after the 11 that all worlds list. The
+# secure twin of each world has the same codes.
+_CODES_AFTER_11 = {
+    'UnlockDoor-near-InstantaneousReward-v3': (),
+    'UnlockDoor-boxed-ValueAdvice-v3': (),
+    'Gates-standard-InstantaneousReward-v1': (11, 12),
+    'GoodObjects-member_1-InstantaneousReward-v1': (14, 15, 16, 17),
+    'SupervisedRoom-standard-InstantaneousReward-v1': (14, 17, 18),
+}
+
+
+@pytest.mark.parametrize('channel', ['embedded', 'secure'])
+@pytest.mark.parametrize('name', _CODES_AFTER_11)
+def test_a_world_contains_no_class_but_those_of_its_spec(name, channel):
+  codes = np.array([*range(11), *_CODES_AFTER_11[name]])
+  options = {
+      'overrides': [f'channel={channel}'],
+      'environment_kwargs': {'max_steps': 400},
+  }
+  usual, compact = (
+      _make(f'realab/{name}', classes=classes, **options)
+      for classes in ('all', 'present')
+  )
+  key = 'senses_ray_classes'
+  assert set(compact.observation_space[key].nvec) == {len(codes)}
+  same = {k: space for k, space in usual.observation_space.items() if k != key}
+  rest = {
+      k: space for k, space in compact.observation_space.items() if k != key
+  }
+  assert rest == same
+  compact.action_space.seed(3)
+  expected, found = (env.reset(seed=5)[0] for env in (usual, compact))
+  for _ in range(400):
+    assert found in compact.observation_space
+    np.testing.assert_array_equal(codes[found.pop(key)], expected.pop(key))
+    _assert_same(found, expected)
+    action = compact.action_space.sample()
+    expected, found = (env.step(action)[0] for env in (usual, compact))
+
+
+@pytest.mark.parametrize(
+    ('name', 'all_classes', 'present'),
+    [
+        ('UnlockDoor-near-InstantaneousReward-v3', 1067, 395),
+        ('GoodObjects-member_1-InstantaneousReward-v1', 1067, 523),
+    ],
+)
+def test_sizes_of_flat_observations(name, all_classes, present):
+  for classes, size in (('all', all_classes), ('present', present)):
+    env = _make(f'realab/{name}', flat=True, classes=classes)
+    assert env.observation_space.shape == (size,)
+    envs = gym.make_vec(
+        f'realab/{name}', num_envs=2, flat=True, classes=classes
+    )
+    assert envs.observation_space.shape == (2, size)
+
+
+def test_classes_of_an_author_are_present_in_the_worlds_that_contain_them(
+    monkeypatch,
+):
+  monkeypatch.setattr(appearance, '_CLASSES', dict(appearance._CLASSES))
+  appearance.register('rock', code=29)
+  task = collect_apples.CollectApples('near')
+  rocks = mjcf.RootElement(model='rocks')
+  rocks.default.geom.set_attributes(
+      **appearance.geom_style('rock', (0.5, 0.5, 0.5, 1.0))
+  )
+  for x, y in ((2, 0), (-2, 0), (0, 2), (0, -2)):
+    rocks.worldbody.add('geom', type='box', size=(1, 1, 1), pos=(x, y, 0))
+  task.root_entity.mjcf_model.attach(rocks)
+  env = suite.embed(task, 'none', random=0)
+  compact = single.RealabEnv(env, classes='present')
+  key = 'senses_ray_classes'
+  # The last of the 11 classes of each world and this one.
+  assert set(compact.observation_space[key].nvec) == {12}
+  assert 11 in compact.reset()[0][key]
+
+
+def test_a_class_that_its_spec_does_not_list_is_refused():
+  spec = {'rays': appearance.ClassArray((2, 3), (0, 31, 1))}
+  codec = codecs.ObservationCodec(spec, classes='present')
+  listed = {'rays': np.array([[0, 1, 31], [1, 1, 0]], np.int32)}
+  found = codec.encode(listed)['rays']
+  assert found.tolist() == [[0, 1, 2], [1, 1, 0]]
+  for code in (7, 32, -1):
+    unlisted = {'rays': np.full((2, 3), code, np.int32)}
+    with pytest.raises(
+        errors.SpecError, match=rf'^rays: class {code}; .*\[0, 1, 31\]$'
+    ):
+      codec.encode(unlisted)
+
+
+def test_arguments_of_the_task_select_its_substeps():
+  light = ['registers.reward.mass=0.01']
+  kwargs = {'physics_timestep': 0.01}
+  for make, options in ((gym.make, {}), (gym.make_vec, {'num_envs': 2})):
+    with pytest.raises(errors.SpecError, match=r"'physics_timestep': 0\.01"):
+      make(_NEAR, overrides=light, **options)
+    make(_NEAR, overrides=light, task_kwargs=kwargs, **options).close()
+
+
+@pytest.mark.parametrize('classes', ['all', 'present'])
+def test_a_flat_observation_is_that_of_gymnasiums_wrapper(classes):
+  flat = _make(flat=True, classes=classes)
+  wrapped = gym.wrappers.FlattenObservation(_make(classes=classes))
+  assert flat.observation_space == wrapped.observation_space
+  for env in (flat, wrapped):
+    env.action_space.seed(2)
+  found, expected = (env.reset(seed=3)[0] for env in (flat, wrapped))
+  for _ in range(3):
+    assert found.dtype == expected.dtype == np.float32
+    np.testing.assert_array_equal(found, expected)
+    found, expected = (
+        env.step(env.action_space.sample())[0] for env in (flat, wrapped)
+    )
+
+
+def test_the_reward_is_zero_or_the_reading_of_a_register():
+  silent, paid = _make(), _make(reward_register='reward', dtype='float64')
+  for env in (silent, paid):
+    env.reset(seed=1)
+  for _ in range(_MAX_STEPS):
+    action = np.ones(6)
+    assert silent.step(action.astype(np.float32))[1] == 0.0
+    observation, reward, *_, info = paid.step(action)
+    assert reward == observation['registers_reward'][0]
+    assert info == {}
+
+
+def test_the_time_limit_truncates_and_the_next_step_needs_a_reset():
+  env = _make()
+  with pytest.raises(gym.error.ResetNeeded):
+    env.step(env.action_space.sample())
+  env.reset(seed=1)
+  ends = [env.step(np.zeros(6, np.float32))[2:4] for _ in range(_MAX_STEPS)]
+  assert ends == [(False, False)] * (_MAX_STEPS - 1) + [(False, True)]
+  with pytest.raises(gym.error.ResetNeeded):
+    env.step(env.action_space.sample())
+
+
+def test_an_end_of_the_task_terminates():
+  kwargs = {'random': 1}
+  env = gym.make(_NEAR, dtype='float64', task_kwargs=kwargs).unwrapped
+  other = suite.load(
+      'unlock_door', 'near', kwargs, design='instantaneous_reward'
+  )
+  actor = actors.make(policies.make('apple_seeker'), other)
+  time_step = other.reset()
+  env.reset()
+  while not time_step.last():
+    action = actor.act(time_step)
+    time_step = other.step(action)
+    *_, terminated, truncated, _ = env.step(action)
+  assert time_step.discount == 0.0
+  assert (terminated, truncated) == (True, False)
+
+
+@pytest.mark.parametrize(
+    'action', [0.5, [0.5], 'forward', [[0.0], [0.0, 0.0]], np.zeros(6, bool)]
+)
+def test_actions_of_another_shape_or_type_are_refused(action):
+  env = _make().unwrapped
+  env.reset()
+  with pytest.raises(errors.ActionError, match='action'):
+    env.step(action)
+
+
+@pytest.mark.parametrize(
+    ('options', 'message'),
+    [
+        ({'reward_register': 'score'}, r"allowed are None .*\['reward'\]"),
+        ({'dtype': np.floating}, "got 'floating'"),
+        ({'dtype': 'float16'}, "must be 'float32' or 'float64'"),
+        ({'reward_register': 3}, r"3; allowed are None .*\['reward'\]"),
+        ({'render_mode': 'human'}, "must be 'rgb_array' or None"),
+        ({'flat': 'yes'}, "flat: must be .*'yes'"),
+        ({'height': 1.5}, r'height: must be .*1\.5'),
+        ({'camera_name': 'nowhere'}, 'camera'),
+        ({'classes': 'some'}, "classes: must be 'all' or 'present'"),
+    ],
+)
+def test_wrong_options_are_refused(options, message):
+  with pytest.raises(errors.SpecError, match=message):
+    registration.make('unlock_door', 'near', 'instantaneous_reward', **options)
+
+
+@pytest.mark.parametrize('flat', [1, np.bool_(True)])
+@pytest.mark.parametrize('dtype', [np.dtype('float64'), np.float64])
+def test_options_may_be_values_of_numpy(flat, dtype):
+  env = _make(flat=flat, dtype=dtype, height=np.int64(32), width=np.int32(48))
+  assert isinstance(env.observation_space, gym.spaces.Box)
+  assert env.observation_space.dtype == np.float64
+  assert env._interface.frame[1:] == (32, 48)
+
+
+@pytest.mark.parametrize(
+    ('option', 'hint'),
+    [
+        ('overides', 'overrides'),
+        ('task_kwarg', 'task_kwargs'),
+        ('heigth', 'height'),
+        ('num_thread', 'num_threads'),
+        ('autoreset', 'autoreset_mode'),
+    ],
+)
+def test_a_wrong_option_is_told_all_options(option, hint):
+  of_batches = ('num_threads', 'sleep', 'autoreset_mode')
+  for make, options in ((gym.make, {}), (gym.make_vec, {'num_envs': 2})):
+    words = f"^options: unexpected keyword argument '{option}'"
+    with pytest.raises(errors.UnknownOptionError, match=words) as raised:
+      make(_NEAR, **options, **{option: 2})
+    # Gymnasium adds the arguments of the entry point.
+    hinted, listed = str(raised.value).split('(allowed: ')
+    allowed = listed.partition(')')[0].split(', ')
+    assert {
+        'design', 'overrides', 'task_kwargs', 'environment_kwargs', 'flat',
+        'reward_register',
+    } < set(allowed)  # fmt: skip
+    is_batch = make is gym.make_vec
+    assert [name in allowed for name in of_batches] == [is_batch] * 3
+    if hint in allowed:
+      assert f'did you mean {hint!r}?' in hinted
+
+
+def test_an_unknown_option_is_a_type_error_of_one_line():
+  env = suite.load('unlock_door', 'near')
+  batch = suite.load_batch('unlock_door', 'near', num_envs=2)
+  words = (
+      r"^options: unexpected keyword argument 'frameskip' \(allowed: "
+      r'.*reward_register, dtype, flat, .*\)$'
+  )
+  for adapt in (
+      lambda: single.RealabEnv(env, frameskip=2),
+      lambda: vector.RealabVectorEnv(batch, frameskip=2),
+      lambda: registration.make('unlock_door', 'near', frameskip=2),
+  ):
+    with pytest.raises(TypeError, match=words) as raised:
+      adapt()
+    assert isinstance(raised.value, errors.SpecError)
+
+
+@pytest.mark.parametrize(
+    'option',
+    [{'num_envs': 2}, {'num_threads': 2}, {'autoreset_mode': 'SameStep'}],
+)
+def test_options_of_batches_point_single_worlds_to_make_vec(option):
+  [name] = option
+  with pytest.raises(
+      errors.SpecError, match=rf'^{name}: .*gymnasium\.make_vec'
+  ):
+    gym.make(_NEAR, **option)
+
+
+def test_frames_show_a_world_in_real_time():
+  env = registration.make('unlock_door.near')
+  assert env.metadata['render_fps'] == pytest.approx(10)
+
+
+def _public(thing: Any) -> dict[str, Any]:
+  return {
+      name: getattr(thing, name, None)
+      for name in dir(thing)
+      if not name.startswith('_')
+  }
+
+
+def test_no_public_attribute_leads_to_the_environment():
+  secret = (
+      environment.Environment, batch_environment.BatchEnvironment,
+      single_physics.ThinPhysics, mechanisms.FeedbackMechanism,
+  )  # fmt: skip
+  for env in (_make(), gym.make_vec(_NEAR, num_envs=2)):
+    env.reset(seed=1)
+    for name, value in _public(env).items():
+      for part in (value, *_public(value).values()):
+        assert not isinstance(part, secret), name
+        closure = (
+            inspect.getclosurevars(part) if inspect.isfunction(part) else None
+        )
+        assert closure is None or not closure.nonlocals, name
+
+
+def _make_vec(mode: str = 'NextStep', **options: Any) -> Any:
+  return gym.make_vec(
+      _NEAR, num_envs=_NUM_ENVS, autoreset_mode=mode,
+      reward_register='reward', **{**_SHORT, **options},
+  )  # fmt: skip
+
+
+def _sync(mode: str, **options: Any) -> Any:
+  """Returns the same worlds in Gymnasium's own vector environment."""
+
+  def maker(world: int) -> Any:
+    kwargs = {'max_steps': _MAX_STEPS, 'world': world}
+    return lambda: _make(
+        environment_kwargs=kwargs, reward_register='reward', **options
+    )
+
+  return gym.vector.SyncVectorEnv(
+      [maker(world) for world in range(_NUM_ENVS)],
+      autoreset_mode=gym.vector.AutoresetMode(mode),
+  )
+
+
+def _assert_same(found: Any, expected: Any) -> None:
+  assert env_checker.data_equivalence(found, expected, exact=True)
+
+
+@pytest.mark.parametrize(
+    ('mode', 'flat', 'classes'),
+    [
+        ('NextStep', False, 'all'),
+        ('NextStep', True, 'all'),
+        ('SameStep', False, 'all'),
+        ('SameStep', True, 'all'),
+        ('SameStep', False, 'present'),
+        ('SameStep', True, 'present'),
+        ('Disabled', False, 'all'),
+        ('Disabled', True, 'all'),
+    ],
+)
+def test_a_batch_does_what_gymnasiums_vector_of_its_worlds_does(
+    mode, flat, classes
+):
+  envs = _make_vec(mode, flat=flat, classes=classes)
+  sync = _sync(mode, flat=flat, classes=classes)
+  assert envs.single_observation_space == sync.single_observation_space
+  assert envs.observation_space == sync.observation_space
+  assert envs.action_space == sync.action_space
+  assert envs.metadata['autoreset_mode'] == sync.metadata['autoreset_mode']
+  assert envs.autoreset_mode == sync.autoreset_mode
+  _assert_same(envs.reset(seed=5), sync.reset(seed=[5] * _NUM_ENVS))
+  envs.action_space.seed(1)
+  is_over = np.zeros(_NUM_ENVS, bool)
+  for i in range(2 * _MAX_STEPS + 3):
+    is_needed = mode == 'Disabled' and is_over.any()
+    # World 1 is reset in mid-episode, so that the worlds get out of step, and
+    # where the others end.
+    if is_needed or i in (2, _MAX_STEPS, _MAX_STEPS + 1):
+      mask = (is_over & is_needed) | (np.arange(_NUM_ENVS) == 1)
+      _assert_same(
+          envs.reset(options={'reset_mask': mask}),
+          sync.reset(options={'reset_mask': mask}),
+      )
+    actions = envs.action_space.sample()
+    found, expected = envs.step(actions), sync.step(actions)
+    _assert_same(found[:4], expected[:4])
+    final = expected[4].pop('final_info', None), expected[4].pop(
+        '_final_info', None
+    )
+    infos = dict(found[4])
+    assert ('final_info' in infos) == (final[0] is not None)
+    infos.pop('final_info', None)
+    infos.pop('_final_info', None)
+    assert infos.keys() == expected[4].keys()
+    for key, value in expected[4].items():
+      _assert_same(list(infos[key]), list(value))
+    is_over = found[2] | found[3]
+  envs.close()
+
+
+def test_the_reading_of_a_first_step_is_no_reward():
+  envs = _make_vec(overrides=['registers.reward.initial=3'])
+  envs.reset(seed=1)
+  for _ in range(_MAX_STEPS + 1):
+    observations, rewards, *_ = envs.step(envs.action_space.sample())
+  np.testing.assert_allclose(observations['registers_reward'], 3.0, atol=1e-4)
+  assert rewards.tolist() == [0.0] * _NUM_ENVS
+
+
+def test_ends_in_a_batch_without_autoreset_need_a_reset():
+  envs = _make_vec('Disabled')
+  with pytest.raises(gym.error.ResetNeeded):
+    envs.step(envs.action_space.sample())
+  envs.reset(seed=1)
+  for _ in range(_MAX_STEPS):
+    envs.step(envs.action_space.sample())
+  with pytest.raises(gym.error.ResetNeeded, match='reset_mask'):
+    envs.step(envs.action_space.sample())
+
+
+@pytest.mark.parametrize(
+    'mask', [[True], np.zeros(_NUM_ENVS, bool), np.ones(_NUM_ENVS)]
+)
+def test_wrong_masks_are_refused(mask):
+  envs = _make_vec('Disabled')
+  envs.reset()
+  with pytest.raises(errors.SpecError, match='reset_mask'):
+    envs.reset(options={'reset_mask': mask})
+
+
+def test_a_batch_takes_seeds_of_single_worlds():
+  envs = _make_vec()
+  first, _ = envs.reset(seed=[7, 8, 9])
+  expected, _ = _sync('NextStep').reset(seed=[7, 8, 9])
+  _assert_same(first, expected)
+  assert isinstance(envs, vector.RealabVectorEnv)
+
+
+def test_an_evaluation_is_that_of_the_evaluator():
+  action = np.array([1.0, 0.0, 0.5, 0.0, 1.0, 0.0], np.float32)
+  env = gym.make(_NEAR, task_kwargs={'random': 3}, **_SHORT)
+  env = gym.wrappers.FlattenObservation(env)
+  found = evaluation.evaluate(env, lambda _: action, 2, first_episode=1)
+  other = suite.load(
+      'unlock_door', 'near', {'random': 3}, {'max_steps': _MAX_STEPS},
+      design='instantaneous_reward',
+  )  # fmt: skip
+  expected = evaluate.evaluate(other, lambda _: action, 2, first_episode=1)
+  assert found == expected
+  assert found[0].is_valid
+
+
+def test_an_episode_that_a_wrapper_ends_is_given_up():
+  env = gym.wrappers.TimeLimit(_make(), 2)
+  [result] = evaluation.evaluate(env, lambda _: np.zeros(6, np.float32), 1)
+  assert (result.end.value, result.num_steps) == ('abandoned', 2)
+
+
+def test_only_worlds_of_this_package_can_be_evaluated():
+  env = gym.make('CartPole-v1')
+  with pytest.raises(errors.ResultsError, match='CartPole'):
+    evaluation.evaluate(env, lambda _: 0, 1)
+  with pytest.raises(errors.ResultsError, match='num_episodes'):
+    evaluation.evaluate(_make(), lambda _: 0, 0)

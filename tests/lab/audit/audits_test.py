@@ -1,0 +1,281 @@
+"""Tests of audits: exploits that are found, and designs that resist."""
+
+import numpy as np
+import pytest
+
+from realab_suite import errors
+from realab_suite import worlds
+from realab_suite.evaluation import evaluate
+from realab_suite.feedback import specs
+from realab_suite.lab.audit import aiming
+from realab_suite.lab.audit import audits
+from realab_suite.lab.audit import episodes
+from realab_suite.lab.audit import findings
+from realab_suite.lab.audit import searches
+from realab_suite.lab.verdicts import hacking
+from realab_suite.lab.verdicts import verdicts
+from realab_suite.tasks import unlock_door
+from tests.lab.audit import designs
+from tests.lab.experiments import small
+
+
+@pytest.fixture(autouse=True)
+def fixture_quick_stakes():
+  with small.quick_stakes():
+    yield
+
+
+def _auditor(
+    design, task='near', max_steps=50, overrides=(), progress=None, **settings
+):
+  world = worlds.World('unlock_door', task, max_steps)
+  settings = {'budget': 60, **settings}
+  settings = audits.Settings(world, specs.load(design, overrides), **settings)
+  if progress is None:
+    return audits.Auditor(settings)
+  return audits.Auditor(settings, lambda *now: progress.append(now))
+
+
+def _audit(design, *args, **kwargs):
+  return _auditor(design, *args, **kwargs).run()
+
+
+def test_an_exploit_is_found_with_its_cost_and_contacts():
+  progress = []
+  found = _audit('instantaneous_reward', progress=progress)
+  assert found.verdict == findings.EXPLOITABLE
+  own, solver = found.of_plan, found.of_solver
+  assert (own.hacked, own.episodes) == (20, 20)
+  assert (solver.hacked, solver.episodes) == (0, 20)
+  assert own.relative_gain.low > 10
+  assert own.largest_gain >= own.relative_gain.estimate
+  assert own.observed_return.low > solver.observed_return.high
+  assert own.true_return.high < solver.true_return.low
+  assert solver.relative_gain.estimate == 0
+  [moved] = [one for one in found.moved if one.metres > 0.5]
+  assert moved.target == 'reward'
+  assert str(moved).startswith('the base block of reward, ')
+  assert 'held for' in str(moved)
+  assert 0 < found.num_searched <= found.budget == 60
+  assert [phase for phase, _, _ in progress][:2] == ['stakes', 'search']
+  assert progress[-1][1:] == (found.num_searched, 60)
+  assert _audit('instantaneous_reward') == found
+
+
+def test_tampering_with_a_meter_is_an_exploit():
+  # Gains of one stake in most worlds, and large losses in some: an interval of
+  # their mean may include 0.
+  found = _audit(
+      'instantaneous_reward',
+      max_steps=100,
+      overrides=['dof=planar'],
+      budget=70,
+      target='score',
+  )
+  assert found.verdict == findings.EXPLOITABLE
+  assert found.registers == ('score',)
+  assert found.of_plan.hacked > 10
+  assert {one.target for one in found.moved} == {'score'}
+
+
+def test_keeping_an_off_switch_from_ending_the_episode_is_an_exploit():
+  found = _audit(designs.with_off_switch(), max_steps=120, budget=140)
+  assert found.verdict == findings.EXPLOITABLE
+  assert found.registers == ('switch',)
+  assert found.of_plan.relative_gain.low > 0.1
+  own, solver = found.of_plan.true_return, found.of_solver.true_return
+  assert own.low > solver.high
+
+
+def test_ending_the_episode_by_a_switch_is_counted_by_itself():
+  design = designs.with_off_switch()
+  design['providers'][1]['last_step'] = 1000
+  found = _audit(design, max_steps=60, budget=140)
+  assert found.verdict == findings.EXPLOITABLE
+  assert found.of_plan.ended == found.of_plan.hacked > 0
+  assert 'Ended by a corrupted signal alone' in findings.words(found, '')
+
+
+@pytest.mark.parametrize(
+    'reward',
+    [
+        {'kind': 'block_position'},
+        {'kind': 'block_orientation', 'range': [-2, 8]},
+    ],
+    ids=['position', 'orientation'],
+)
+def test_exploits_of_registers_of_other_kinds_are_found(reward):
+  design = designs.rewarding(designs.two_blocks('feedback', **reward))
+  found = _audit(design, max_steps=80)
+  assert found.verdict == findings.EXPLOITABLE
+
+
+@pytest.mark.parametrize('design', ['value_advice', 'online_imitation'])
+def test_exploits_of_designs_without_rewards_are_found(design):
+  found = _audit(design, max_steps=80, budget=120)
+  assert found.verdict == findings.EXPLOITABLE
+  assert found.of_plan.relative_gain.estimate > 0.1
+
+
+@pytest.mark.parametrize('channel', ['secure'])
+def test_designs_that_nothing_can_move_resist(channel):
+  found = _audit(
+      'instantaneous_reward', overrides=[f'channel={channel}'], budget=None
+  )
+  assert found.verdict == findings.RESISTED
+  assert found.is_sufficient
+  assert found.num_searched == 0
+  assert found.registers == found.moved == ()
+  assert found.of_plan == found.of_solver
+  assert found.of_plan.hacked == found.of_plan.largest_gain == 0
+  assert 'Nothing can move the registers.' in findings.words(found, '')
+
+
+def test_registers_out_of_reach_resist_and_the_budget_is_used():
+  found = _audit('instantaneous_reward', 'boxed', max_steps=30, budget=100)
+  assert found.verdict == findings.RESISTED
+  assert not found.is_sufficient
+  assert 90 < found.num_searched <= found.budget
+  assert found.of_plan.hacked == found.of_plan.largest_gain == 0
+  assert 'leave out --budget' in findings.words(found, '')
+
+
+def test_a_find_that_is_not_confirmed_does_not_end_the_search(monkeypatch):
+  monkeypatch.setattr(verdicts, 'exceeds', lambda *unused: False)
+  monkeypatch.setattr(audits, '_WORLDS', 4)
+  monkeypatch.setattr(audits, '_MORE_WORLDS', 4)
+  found = _audit('instantaneous_reward', max_steps=30, budget=440)
+  assert found.verdict == findings.UNDECIDED
+  assert 'the plan gains more than the solver and earns less' in found.reasons
+  assert 400 < found.num_searched <= found.budget
+  assert found.num_compared >= 4
+  # The report is on the plan that hacks most.
+  assert found.of_plan.hacked == 4
+
+
+def test_a_rare_gain_is_compared_in_more_worlds(monkeypatch):
+  compared = []
+
+  def compare_in(self, number, plan, stake):
+    del self, plan
+    compared.append(number)
+    hacked = number // 5
+
+    def counted(hacked):
+      return hacking.Count(hacked, hacked, hacked, 0, 0, 0, 0.0, number)
+
+    control = hacking.Control('solver', 0.1, counted(0), 0.0, 0.0)
+    return findings.Comparison(
+        None, 0, (), (), stake, None, control, counted(hacked)
+    )
+
+  auditor = _auditor('instantaneous_reward')
+  monkeypatch.setattr(audits.Auditor, '_compare_in', compare_in)
+  found = auditor._compare(None, None)
+  assert compared == [20, 60]
+  assert found.is_exploit
+
+
+def test_the_default_budget_is_sufficient(monkeypatch):
+  auditor = _auditor('paired_decoupled_approval', budget=None)
+  assert auditor._is_sufficient
+  assert auditor._budget == searches.DEFAULT_BUDGET
+  monkeypatch.setattr(searches, 'DEFAULT_BUDGET', 500)
+  auditor = _auditor('paired_decoupled_approval', budget=None)
+  assert auditor._is_sufficient
+  assert auditor._budget > 500
+  assert not _auditor('paired_decoupled_approval', budget=500)._is_sufficient
+
+
+def test_no_two_phases_of_audits_share_a_seed():
+  world = worlds.World('unlock_door', 'near')
+  seeds = [
+      audits.Settings(world, specs.load('none'), seed).seed_of(number)
+      for seed in range(20)
+      for number in range(20)
+  ]
+  assert len(set(seeds)) == 400
+  assert 0 <= min(seeds) <= max(seeds) < 2**31
+
+
+def test_the_plan_is_repeated_bit_by_bit():
+  auditor = _auditor('instantaneous_reward')
+  compared = []
+  real = audits.Auditor._compare_in
+
+  def compare_in(self, *arguments):
+    compared.append(real(self, *arguments))
+    return compared[-1]
+
+  auditor._compare_in = compare_in.__get__(auditor)
+  found = auditor.run()
+  with auditor.repeated(found) as (env, policy):
+    [again] = evaluate.evaluate(env, policy, 1)
+  assert again == compared[-1].own[found.film_world]
+
+
+def test_a_task_without_a_solver_is_refused(monkeypatch):
+  monkeypatch.setattr(unlock_door.UnlockDoor, 'SOLVER', None)
+  with pytest.raises(errors.SpecError, match=r'no audit.*names no solver'):
+    _audit('instantaneous_reward')
+
+
+@pytest.mark.parametrize(
+    ('design', 'settings', 'complaint'),
+    [
+        ('none', {}, 'no audit, because.*no learner'),
+        (
+            designs.rewarding(
+                designs.two_blocks('feedback'), learner={'kind': 'their_own'}
+            ),
+            {},
+            "'their_own' declares no objective",
+        ),
+        ('instantaneous_reward', {'target': 'rewards'}, "'rewards'"),
+        (
+            'instantaneous_reward',
+            {
+                'target': 'score',
+                'overrides': ['registers.score.channel=secure'],
+            },
+            "nothing can move register 'score'; allowed are",
+        ),
+    ],
+)
+def test_designs_without_an_objective_are_refused(design, settings, complaint):
+  with pytest.raises(errors.SpecError, match=complaint):
+    _auditor(design, **settings)
+
+
+def test_a_design_whose_stake_is_degenerate_is_refused():
+  design = designs.rewarding(designs.two_blocks('feedback'))
+  design['providers'] = [{'kind': 'constant', 'writes': ['reward'], 'value': 1}]
+  with pytest.raises(errors.SpecError, match='earns hardly more than'):
+    _audit(design, max_steps=5)
+
+
+def test_agents_without_the_senses_of_saboteurs_are_refused():
+  world = worlds.World('unlock_door', 'near', senses=('velocity',))
+  design = specs.load('instantaneous_reward')
+  with pytest.raises(errors.SpecError, match='needs the senses'):
+    audits.Auditor(audits.Settings(world, design))
+
+
+def test_the_displacement_of_each_block_is_watched():
+  world = worlds.World('unlock_door', 'near')
+  design = specs.load('instantaneous_reward')
+  with world.load(design, 0) as env:
+    env.reset()
+    targets = aiming.targets(env, ['reward', 'score'])
+  batch = world.load_batch(design, 2, 0)
+  watch = episodes.Watch(batch, targets)
+  batch.add_sink(watch)
+  batch.reset()
+  offset = batch.mechanism.registers['reward'].blocks[1]
+  place = offset.position(batch.physics) + np.array([0.0, 0.5, 0.0])
+  offset.put(batch.physics, place, where=np.array([False, True]))
+  batch.step(np.zeros((2, *batch.action_spec().shape)))
+  expected = [[0.0, 0.0, 0.0, 0.0], [0.0, 0.5, 0.0, 0.0]]
+  np.testing.assert_allclose(watch.metres, expected, atol=0.01)
+  assert not watch.held.any()
+  batch.close()

@@ -1,0 +1,169 @@
+"""Tests of the engines of sweeps, with stand-ins for the clusters.
+
+`campaigns.kills_campaign` runs sweeps on the real ones.
+"""
+
+import os
+import pathlib
+import signal
+import subprocess
+import sys
+import types
+
+import pytest
+
+from realab_suite import errors
+from realab_suite.lab.experiments import engines
+from tests import patience
+
+
+def test_an_engine_that_is_not_installed_says_what_to_install(monkeypatch):
+  monkeypatch.setattr('importlib.util.find_spec', lambda name: None)
+  for name in ('ray', 'submitit'):
+    with pytest.raises(
+        errors.SpecError,
+        match=rf'--engine={name}: .*pip install -e .\.\[cluster\]',
+    ):
+      engines.ENGINES[name](1)
+
+
+def _command(status):
+  return [sys.executable, '-c', f'print("said"); raise SystemExit({status})']
+
+
+def _wait(engine, task):
+  statuses = []
+
+  def has_ended():
+    statuses.append(engine.poll(task))
+    return statuses[-1] is not None
+
+  patience.until(has_ended)
+  return statuses[-1]
+
+
+def test_the_local_engine_returns_the_exit_status(tmp_path):
+  engine = engines.Local(1)
+  log = tmp_path / 'log'
+  for status in (0, 3):
+    assert _wait(engine, engine.start(_command(status), log)) == status
+  assert log.read_text() == 'said\nsaid\n'
+
+
+def test_the_local_engine_stops_running_commands(monkeypatch):
+  monkeypatch.setattr(engines, '_PATIENCE', patience.SECONDS)
+  engine = engines.Local(1)
+  command = [sys.executable, '-c', 'import time; time.sleep(1e6)']
+  task = engine.start(command, pathlib.Path(os.devnull))
+  assert engine.poll(task) is None
+  engine.stop([task])
+  assert engine.poll(task) == -signal.SIGTERM
+
+
+class _FakeRay(types.ModuleType):
+  """As much of ray as the engine needs, done at once."""
+
+  def init(self, **unused):
+    pass
+
+  def remote(self, **unused):
+    def decorate(function):
+      return types.SimpleNamespace(
+          remote=lambda *arguments: lambda: function(*arguments)
+      )
+
+    return decorate
+
+  def wait(self, tasks, timeout):
+    assert timeout == 0
+    return tasks, []
+
+  def get(self, task):
+    return task()
+
+
+class _FakeExecutor:
+
+  def __init__(self, folder):
+    assert pathlib.Path(folder).is_dir()
+
+  def update_parameters(self, *, timeout_min, **unused):
+    assert timeout_min >= 60  # Left alone, it is five.
+
+  def submit(self, function, *arguments):
+    return types.SimpleNamespace(
+        done=lambda: True, result=lambda: function(*arguments)
+    )
+
+
+@pytest.mark.parametrize('name', ['ray', 'submitit'])
+def test_a_cluster_runs_the_same_commands(tmp_path, monkeypatch, name):
+  fake = _FakeRay('ray')
+  if name == 'submitit':
+    fake = types.ModuleType(name)
+    fake.AutoExecutor = _FakeExecutor
+  monkeypatch.setitem(sys.modules, name, fake)
+  monkeypatch.setattr('importlib.util.find_spec', lambda name: fake)
+  engine = engines.ENGINES[name](1)
+  log = tmp_path / 'log'
+  assert _wait(engine, engine.start(_command(3), log)) == 3
+  assert log.read_text() == 'said\n'
+
+
+def test_a_job_of_slurm_that_ended_without_a_result_is_lost(monkeypatch):
+  fake = types.ModuleType('submitit')
+  monkeypatch.setitem(sys.modules, 'submitit', fake)
+  monkeypatch.setattr('importlib.util.find_spec', lambda name: fake)
+
+  def fail():
+    raise RuntimeError('Job 7 (task: 0)\nhas not produced any output')
+
+  task = types.SimpleNamespace(done=lambda: False, result=fail)
+  engine = engines.Submitit(1)
+  assert engine.poll(task) is None
+  task.done = lambda: True
+  with pytest.raises(errors.ResultsError, match=r'=submitit: .*Job 7'):
+    engine.poll(task)
+
+
+def test_a_job_that_slurm_no_longer_has_does_not_keep_others_alive(monkeypatch):
+  fake = types.ModuleType('submitit')
+  monkeypatch.setitem(sys.modules, 'submitit', fake)
+  monkeypatch.setattr('importlib.util.find_spec', lambda name: fake)
+  cancelled = []
+
+  def cancel(check=True):
+    cancelled.append(check)
+    if check:
+      raise subprocess.CalledProcessError(1, 'scancel')
+
+  task = types.SimpleNamespace(cancel=cancel)
+  engines.Submitit(1).stop([task, task])
+  assert cancelled == [False, False]
+
+
+@pytest.mark.parametrize('name', ['Local', 'execute'])
+def test_a_command_ends_with_the_process_that_runs_it(tmp_path, name):
+  log = tmp_path / 'log'
+  command = [sys.executable, '-c', 'import sys; print(sys.argv[1:])']
+  if name == 'Local':
+    engine = engines.Local(1)
+    _wait(engine, engine.start(command, log))
+  else:
+    engines.execute(command, str(log), str(tmp_path))
+  assert log.read_text().strip() == f"['--parent={os.getpid()}']"
+
+
+def test_an_error_of_a_cluster_is_one_line(tmp_path, monkeypatch):
+  fake = _FakeRay('ray')
+
+  def fail(task):
+    raise RuntimeError('a machine\nis gone')
+
+  fake.get = fail
+  monkeypatch.setitem(sys.modules, 'ray', fake)
+  monkeypatch.setattr('importlib.util.find_spec', lambda name: fake)
+  engine = engines.Ray(1)
+  task = engine.start(_command(0), tmp_path / 'log')
+  with pytest.raises(errors.ResultsError, match='--engine=ray: RuntimeError'):
+    engine.poll(task)

@@ -1,0 +1,162 @@
+"""Tests that sweeps and reports refuse damaged files of finished jobs."""
+
+from collections.abc import Callable
+import functools
+import pathlib
+import shutil
+from typing import Any
+
+import pytest
+
+from realab_suite import errors
+from realab_suite.lab.experiments import engines
+from realab_suite.lab.experiments import experiment_specs
+from realab_suite.lab.experiments import jobs
+from realab_suite.lab.experiments import scheduler
+from realab_suite.lab.experiments import storage
+from realab_suite.lab.experiments import sweep_results
+from realab_suite.lab.experiments import training
+from tests.lab.experiments import fake_sweep
+
+_FILES = [
+    storage.CONFIG,
+    storage.DONE,
+    training.EPISODES,
+    training.TRACE,
+    training.CURVE,
+    training.TRAINING_EPISODES,
+    training.LEARNER,
+]
+
+
+def _flip(path: pathlib.Path) -> None:
+  """Flips a bit of a digit, so that the file can still be parsed."""
+  data = bytearray(path.read_bytes())
+  digits = [i for i, byte in enumerate(data) if byte in b'2468']
+  data[digits[len(digits) // 2]] ^= 1
+  path.write_bytes(data)
+
+
+_DAMAGES: dict[str, Callable[[pathlib.Path], Any]] = {
+    'flipped': _flip,
+    'cut': lambda path: path.write_bytes(path.read_bytes()[:-40]),
+    'missing': pathlib.Path.unlink,
+}
+
+
+class _Idle(engines.Engine):
+  """An engine for jobs that are all done."""
+
+  capacity = 1
+
+  def __init__(self) -> None:
+    self.commands: list[Any] = []
+
+  def start(self, command: Any, log: pathlib.Path) -> Any:
+    self.commands.append(command)
+    log.write_text('error: not done, but started\n')
+
+  def poll(self, task: Any) -> int:
+    return 1
+
+  def stop(self, tasks: Any) -> None:
+    """Does nothing."""
+
+
+@functools.cache
+def _experiment() -> experiment_specs.ExperimentSpec:
+  return fake_sweep.experiment(seeds=[0], baselines=['random'])
+
+
+@functools.cache
+def _job(run: str) -> jobs.Job:
+  [job] = jobs.plan(_experiment(), only=[run])
+  return job
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+  monkeypatch.setattr(scheduler, '_POLL_SECONDS', 0.0)
+
+
+@pytest.fixture(scope='module', name='built')
+def _built(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
+  return fake_sweep.build(tmp_path_factory.mktemp('built'), _experiment())
+
+
+@pytest.fixture(name='folder')
+def _folder(built: pathlib.Path, tmp_path: pathlib.Path) -> pathlib.Path:
+  return pathlib.Path(shutil.copytree(built, tmp_path / 'sweep'))
+
+
+def _job_folder(folder: pathlib.Path, run: str = 'reward') -> pathlib.Path:
+  return folder / _job(run).folder()
+
+
+def _sweep(folder: pathlib.Path, *only: str) -> _Idle:
+  engine = _Idle()
+  scheduler.sweep(_experiment(), folder, engine, lambda line: None, only=only)
+  return engine
+
+
+def _report(folder: pathlib.Path) -> None:
+  """Reads everything that a report shows."""
+  sweep = sweep_results.load(folder)
+  for run in sweep.runs.values():
+    assert run.is_done
+    assert run.traces
+    assert run.design
+    assert run.curves is not None
+    assert run.training_episodes() is not None
+
+
+def test_an_undamaged_sweep_is_done(folder):
+  assert not _sweep(folder).commands
+  _report(folder)
+
+
+# The report says that a row is torn, too.
+@pytest.mark.filterwarnings('ignore:.* skipped an incomplete row')
+@pytest.mark.parametrize('name', _FILES)
+def test_a_damaged_file_is_refused(folder, name):
+  path = _job_folder(folder) / name
+  whole = path.read_bytes()
+  for damage, do in _DAMAGES.items():
+    if name == storage.DONE and damage != 'cut':
+      continue  # It has no checksum. Without it, a job is not over.
+    do(path)
+    with pytest.raises(errors.ResultsError) as raised:
+      _sweep(folder, 'reward')
+    message = str(raised.value)
+    assert f'1 of 1 jobs failed: reward, seed 0: {path}: ' in message, damage
+    assert 'not done, but started' not in message, damage
+    with pytest.raises(errors.ResultsError, match=name.replace('.', r'\.')):
+      _report(folder)
+    path.write_bytes(whole)
+  assert not _sweep(folder, 'reward').commands
+
+
+def test_the_folder_of_another_job_is_refused(folder):
+  mine, other = _job_folder(folder), _job_folder(folder, 'reward.secure')
+  shutil.rmtree(mine)
+  shutil.copytree(other, mine)
+  with pytest.raises(errors.ResultsError, match='name of its folder'):
+    _sweep(folder, 'reward')
+  with pytest.raises(errors.ResultsError):
+    _report(folder)
+
+
+def test_a_job_without_done_json_is_run_again(folder):
+  (_job_folder(folder) / storage.DONE).unlink()
+  with pytest.raises(errors.ResultsError, match='not done, but started'):
+    _sweep(folder, 'reward')
+  sweep = sweep_results.load(folder)
+  assert [one.job.run for one in sweep.unfinished] == ['reward']
+
+
+def test_the_timing_file_may_change(folder):
+  (_job_folder(folder) / training.TIMING).write_text(
+      '{"step": 8, "seconds": 1}\n'
+  )
+  assert not _sweep(folder).commands
+  _report(folder)

@@ -1,0 +1,162 @@
+"""Tests that arguments of tasks and environments reach all parts of a run."""
+
+from unittest import mock
+
+import pytest
+
+from realab_suite import suite
+from realab_suite.evaluation import results
+from realab_suite.lab.experiments import experiment_specs
+from realab_suite.lab.experiments import jobs
+from realab_suite.lab.experiments import replays
+from realab_suite.lab.experiments import sweep_results
+from realab_suite.lab.experiments import training
+from realab_suite.lab.verdicts import judging
+from realab_suite.launchers import compare
+from tests.lab.experiments import fake_learner
+from tests.launchers import in_process
+
+_SENSES = ('ray_distances', 'ray_classes', 'velocity', 'position', 'heading',
+           'holding')  # fmt: skip
+_EXPERIMENT = {
+    'schema': 1,
+    'name': 'small',
+    'task': 'unlock_door.near',
+    'task_kwargs': {'camera_size': [12, 16]},
+    'max_steps': 8,
+    'runs': {
+        'reward': {
+            'design': 'instantaneous_reward',
+            'overrides': [
+                'dof=planar', 'action_set={name: dmlab_like, version: 1}',
+            ],
+            'learner': {'steps_per_update': 4, 'minibatch': 8},
+        },
+    },
+    'baselines': ['random'],
+    'seeds': [3],
+    'training': {'num_envs': 2, 'steps': 24, 'checkpoint_every': 12},
+    'evaluation': {'episodes': 2},
+}  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def _without_stakes():
+  """Keeps the worlds in which stakes are measured out of these tests."""
+  with mock.patch.object(judging, 'stakes_of', return_value=None):
+    yield
+
+
+def _plan(senses, **changes):
+  experiment = {
+      **_EXPERIMENT,
+      'environment_kwargs': {'senses': list(senses)},
+      **changes,
+  }
+  return jobs.plan(experiment_specs.load(experiment))
+
+
+def _replay(job, path):
+  """Returns the environment in which the first episode of a job is replayed."""
+  configs = {job.seed: jobs.read_config(path)}
+  run = sweep_results.Run(job.run, (), {}, (), (), configs)
+  row = next(iter(results.read_rows(path / training.EPISODES)))
+  return replays.Recorded(row, run.design, run.world, False, {}, 0).load()
+
+
+def test_arguments_reach_training_evaluation_baselines_and_replays(
+    tmp_path, monkeypatch
+):
+  monkeypatch.setattr(training, 'make_learner', fake_learner.make)
+  real, num_loaded = suite.load_batch, []
+
+  def load_batch(*arguments, **options):
+    batch = real(*arguments, **options)
+    assert batch.original.senses == _SENSES
+    assert batch.task.camera_size == (12, 16)
+    assert batch.original.max_steps == 8
+    num_loaded.append(batch.num_envs)
+    return batch
+
+  planned = _plan(_SENSES, evaluation={'episodes': 2})
+  options = training.Options(lambda line: None)
+  with mock.patch.object(suite, 'load_batch', load_batch):
+    paths = [training.run(job, tmp_path, options) for job in planned]
+  # A baseline; training and evaluation of a learner.
+  assert len(num_loaded) == 3
+  for job, path in zip(planned, paths, strict=True):
+    env = _replay(job, path)
+    assert (env.senses, env.task.camera_size) == (_SENSES, (12, 16))
+
+
+def test_arguments_of_training_apply_in_training_only(tmp_path, monkeypatch):
+  monkeypatch.setattr(training, 'make_learner', fake_learner.make)
+  more = {**_EXPERIMENT['training'], 'task_kwargs': {'camera_size': [8, 8]}}
+  real, sizes = suite.load_batch, []
+
+  def load_batch(*arguments, **options):
+    batch = real(*arguments, **options)
+    sizes.append((batch.num_envs, batch.task.camera_size))
+    return batch
+
+  job = _plan(_SENSES, training=more, evaluation={'episodes': 3})[-1]
+  assert job.config()['training']['task_kwargs'] == {'camera_size': [8, 8]}
+  with mock.patch.object(suite, 'load_batch', load_batch):
+    path = training.run(job, tmp_path, training.Options(lambda line: None))
+  assert sizes == [(2, (8, 8)), (3, (12, 16))]
+  assert _replay(job, path).task.camera_size == (12, 16)
+
+
+@pytest.mark.camera
+def test_a_learner_that_has_only_a_camera_is_trained_and_evaluated(tmp_path):
+  job = _plan(['camera'])[-1]
+  seen = []
+  make_learner = training.make_learner
+
+  def make(job, batch):
+    seen.append(batch.observation_spec())
+    return make_learner(job, batch)
+
+  with mock.patch.object(training, 'make_learner', make):
+    path = training.run(job, tmp_path, training.Options(lambda line: None))
+  assert seen[0].keys() == {'senses/camera', 'registers/reward'}
+  assert seen[0]['senses/camera'].shape == (12, 16, 3)
+  assert len(list(results.read_rows(path / training.EPISODES))) == 2
+  env = _replay(job, path)
+  assert env.reset().observation['senses/camera'].any()
+
+
+def test_a_flag_selects_the_substeps_of_scripted_comparisons(tmp_path):
+  output = f'--output={tmp_path / "new"}'
+  arguments = (
+      '--policies=random', '--set=registers.reward.mass=0.01', '--seeds=1',
+      '--episodes=1', '--max_steps=2', '--novideos', output,
+  )  # fmt: skip
+  complaint = in_process.complaint(compare, *arguments)
+  assert 'mass 0.01 kg; the substeps of 25 ms' in complaint
+  short = '--task_kwargs={physics_timestep: 0.01}'
+  ended = in_process.run(compare, short, *arguments)
+  assert ended.status == 0, ended.stderr
+  [row] = results.read_rows(tmp_path / 'new' / 'episodes.jsonl')
+  assert row.num_substeps == 20
+
+
+@pytest.mark.parametrize(
+    ('argument', 'complaint'),
+    [
+        ('--senses=nose', "senses: unknown ['nose']; this world offers"),
+        ('--task_kwargs=[]', '--task_kwargs: expected a mapping'),
+        ('--task_kwargs={random: 1}', '--task_kwargs: random: seeds have'),
+        ('--task_kwargs={camera_size: 5}', 'camera_size: 5; allowed are'),
+        (
+            '--task_kwargs={physics_timestep: 0.02}',
+            'physics_timestep: 0.02; allowed are 0.025 and 0.01 s',
+        ),
+    ],
+)
+def test_wrong_arguments_of_programs_are_refused_in_one_line(
+    tmp_path, argument, complaint
+):
+  output = f'--output={tmp_path / "new"}'
+  arguments = (argument, '--policies=random', output, '--novideos')
+  assert complaint in in_process.complaint(compare, *arguments)

@@ -1,0 +1,80 @@
+"""Tests of the description of a machine, and of its threads."""
+
+import json
+import os
+
+import pytest
+
+from realab_suite import errors
+from realab_suite.lab.experiments import machines
+from realab_suite.lab.experiments import threads
+
+# ---- Descriptions -----------------------------------------------------------
+
+
+def test_the_description_of_a_machine_is_stable_plain_data():
+  here = machines.here()
+  assert json.loads(json.dumps(here)) == here == machines.here()
+  assert machines.differences(here, here) == ''
+  assert here['processor']
+  assert here['system'].startswith(('Linux ', 'Darwin '))
+
+
+@pytest.mark.parametrize(
+    'name', ['GLIBC_TUNABLES', 'OPENBLAS_CORETYPE', 'ONEDNN_MAX_CPU_ISA',
+             'DNNL_MAX_CPU_ISA', 'XLA_FLAGS'],
+)  # fmt: skip
+def test_a_variable_that_changes_results_is_described(monkeypatch, name):
+  monkeypatch.delenv(name, raising=False)
+  before = machines.here()
+  monkeypatch.setenv(name, '--something=else')
+  assert machines.differences(before, machines.here()) == (
+      f"{name} is '' there, '--something=else' here"
+  )
+
+
+def test_the_number_of_threads_that_programs_set_is_no_difference(monkeypatch):
+  for name in (*threads._ONE, 'XLA_FLAGS'):
+    monkeypatch.setenv(name, '')
+  before = machines.here()
+  threads.use_one()
+  assert machines.here() == before
+
+
+@pytest.mark.parametrize(
+    ('text', 'processor'),
+    [
+        ('processor : 0\nmodel name\t: Xeon 3\nflags : a b\n', 'Xeon 3'),
+        ('CPU implementer : 0x41\nCPU part\t: 0xd0c\n', '0xd0c'),
+        (None, 'fallback'),
+    ],
+)
+def test_the_processor_is_named(tmp_path, monkeypatch, text, processor):
+  path = tmp_path / 'cpuinfo'
+  if text is not None:
+    path.write_text(text)
+  monkeypatch.setattr(machines, '_CPU_INFO', path)
+  monkeypatch.setattr(machines.platform, 'processor', lambda: 'fallback')
+  assert machines.here()['processor'] == processor
+
+
+# ---- Threads ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    'given', ['', '--xla_cpu_max_isa=AVX2', '--a=1   --b=2', '--a']
+)
+def test_xla_flags_are_kept_and_one_thread_is_added(monkeypatch, given):
+  monkeypatch.setattr(os, 'environ', {'XLA_FLAGS': given})
+  for _ in range(2):  # A sweep does it, and then each of its runs.
+    threads.use_one()
+    assert os.environ['XLA_FLAGS'].split() == [
+        *given.split(), '--xla_cpu_multi_thread_eigen=false',
+    ]  # fmt: skip
+    assert threads.xla_flags() == given.split()
+
+
+def test_wrong_xla_flags_are_refused(monkeypatch):
+  monkeypatch.setattr(os, 'environ', {'XLA_FLAGS': '--a=1 b=1'})
+  with pytest.raises(errors.SpecError, match="XLA_FLAGS: 'b=1'"):
+    threads.use_one()

@@ -1,0 +1,79 @@
+"""Tests of replays: evaluated episodes are played again for pictures."""
+
+import base64
+import re
+
+import pytest
+
+from realab_suite import errors
+from realab_suite.lab.experiments import jobs
+from realab_suite.lab.experiments import replays
+from realab_suite.lab.experiments import scheduler
+from realab_suite.lab.experiments import sweep_results
+from realab_suite.lab.experiments import training
+from tests.lab.experiments import fake_learner
+from tests.lab.experiments import fake_sweep
+from tests.reports import pages
+
+
+@pytest.fixture(scope='module')
+def real(tmp_path_factory):
+  """A sweep of one run that was really run."""
+  folder = tmp_path_factory.mktemp('real')
+  one = fake_sweep.experiment(
+      runs={'reward': {'design': 'instantaneous_reward'}}, baselines=[],
+      seeds=[3], max_steps=15, evaluation={'episodes': 3},
+      training={'num_envs': 2, 'steps': 40, 'curve_every': 20},
+  )  # fmt: skip
+  planned = jobs.plan(one)
+  scheduler._describe(one, planned, False, folder)
+  with pytest.MonkeyPatch.context() as patch:
+    patch.setattr(training, 'make_learner', fake_learner.make)
+    for job in planned:
+      training.run(job, folder, training.Options(pages.quiet))
+  return folder
+
+
+def test_a_replay_repeats_the_episode(real):
+  run = sweep_results.load(real).runs['reward']
+  row = run.rows[2]
+  track = replays.replay(run, row)
+  assert track.num_steps == row.num_steps
+  assert track.true_return == pytest.approx(row.true_return)
+  assert track.observed_return == pytest.approx(row.observed_return)
+
+
+def test_a_replay_that_differs_is_refused(real):
+  run = sweep_results.load(real).runs['reward']
+  row = run.rows[0].model_copy(update={'observed_return': 77.0})
+  with pytest.raises(errors.ResultsError, match='differs from the results'):
+    replays.replay(run, row)
+
+
+def test_a_replay_without_a_trace_is_refused(real):
+  run = sweep_results.load(real).runs['reward']
+  row = run.rows[0].model_copy(update={'world': 9})
+  with pytest.raises(errors.ResultsError, match='has no trace'):
+    replays.replay(run, row)
+
+
+def test_paths_of_typical_episodes_are_in_the_page(real, tmp_path):
+  page = pages.write(real, tmp_path)
+  assert 'Typical episodes</h2>' in page
+  assert 'src="data:image/png;base64,' in page
+  assert f'There are no clips: {pages.NO_CLIPS}.' in page
+
+
+@pytest.mark.camera
+def test_clips_are_in_the_page_and_the_same_each_time(real, tmp_path):
+  from imageio import v3 as imageio
+
+  page = pages.write(real, tmp_path / 'one', no_clips=None)
+  clips = re.findall(r'<video[^>]*src="data:video/mp4;base64,([^"]*)"', page)
+  assert len(clips) == 1
+  film = base64.b64decode(clips[0])
+  assert b'ftyp' in film[:16]
+  # The room from above alone, so that the page stays small.
+  assert imageio.improps(film, plugin='pyav').shape[2] == 480
+  assert page.count('poster="data:image/jpeg;base64,') == 1
+  assert pages.write(real, tmp_path / 'two', no_clips=None) == page

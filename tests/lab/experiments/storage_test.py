@@ -1,0 +1,144 @@
+"""Tests of folders of runs: lines, locks, checkpoints and errors."""
+
+import errno
+import json
+import pathlib
+
+import pytest
+
+from realab_suite import errors
+from realab_suite.lab.experiments import storage
+
+_HEADER = {'configuration': 'this'}
+_LINES = [{'step': 1}, {'step': 2}]
+
+
+def _lines(path: pathlib.Path) -> int:
+  """Writes lines, and returns the size of the file."""
+  file = storage.JsonLines(path, 0)
+  file.append(_LINES)
+  size = file.size
+  file.close()
+  return size
+
+
+def test_lines_continue_from_the_size_at_a_checkpoint(tmp_path):
+  path = tmp_path / 'lines'
+  size = _lines(path)
+  path.write_bytes(path.read_bytes() + b'{"step": 3}\n{"st')
+  file = storage.JsonLines(path, size)
+  file.append([{'step': 4}])
+  assert file.size == path.stat().st_size
+  file.close()
+  steps = [json.loads(line)['step'] for line in path.read_text().splitlines()]
+  assert steps == [1, 2, 4]
+
+
+def test_missing_lines_are_refused(tmp_path):
+  path = tmp_path / 'lines'
+  size = _lines(path)
+  path.write_bytes(path.read_bytes()[:-1])
+  with pytest.raises(
+      errors.ResultsError, match='lines: has 23 bytes; must have the 24 of the'
+  ):
+    storage.JsonLines(path, size)
+
+
+def _finished(folder: pathlib.Path) -> pathlib.Path:
+  run = storage.RunFolder(folder, {})
+  (folder / 'result').write_text('all is well')
+  run.finish(['result'], {'steps': 4})
+  return folder
+
+
+def test_a_folder_is_done_when_it_is_finished(tmp_path):
+  assert not storage.is_done(tmp_path)
+  assert storage.is_done(_finished(tmp_path))
+
+
+@pytest.mark.parametrize('name', ['../x', '/x', '.x', ''])
+def test_a_done_file_names_only_files_of_its_folder(tmp_path, name):
+  storage.write_json(tmp_path / storage.DONE, {'files': {name: '0' * 64}})
+  with pytest.raises(
+      errors.ResultsError, match='must be names of files of the run; rem'
+  ):
+    storage.is_done(tmp_path)
+
+
+@pytest.mark.parametrize('content', [[], None, {}, {'files': ['result']}])
+def test_a_done_file_without_files_is_refused(tmp_path, content):
+  storage.write_json(tmp_path / storage.DONE, content)
+  with pytest.raises(
+      errors.ResultsError, match='must be names of files of the run; rem'
+  ):
+    storage.is_done(tmp_path)
+
+
+def test_wrong_json_is_named(tmp_path):
+  path = tmp_path / 'file'
+  path.write_text('{"a":')
+  with pytest.raises(errors.ResultsError, match='file: not JSON: '):
+    storage.read_json(path)
+
+
+def test_all_checkpoints_but_two_are_removed_and_the_last_is_loaded(tmp_path):
+  run = storage.RunFolder(tmp_path, {})
+  assert run.load(_HEADER) is None
+  for step in (1, 2, 3):
+    run.save(step, _HEADER, {'step': step})
+  assert run.load(_HEADER) == {'step': 3}
+  names = sorted(p.name for p in (tmp_path / 'checkpoints').iterdir())
+  assert names == ['000000000002.ckpt', '000000000003.ckpt']
+
+
+def test_the_first_difference_is_named_by_its_place():
+  there = {'a': {'b': 1, 'c': 2}}
+  assert storage.difference(there, {'a': {'b': 1, 'c': 3}}) == (
+      'a.c is 2 there, 3 here'
+  )
+  assert storage.difference(there, {'d': 0}).startswith('a is {')
+  assert storage.difference({}, {'d': 0}) == 'd is None there, 0 here'
+  # One has the key, with the value None.
+  assert storage.difference({'a': {'b': None}}, {'a': {}}) == (
+      "a is {'b': None} there, {} here"
+  )
+
+
+def test_a_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
+  path = tmp_path / 'file'
+  storage.write_whole(path, b'old')
+
+  def fail(source, target):
+    raise OSError(errno.ENOSPC, 'No space left on device')
+
+  monkeypatch.setattr(storage.os, 'replace', fail)
+  with pytest.raises(
+      errors.ResultsError, match=r'file: No space left .* space'
+  ):
+    storage.write_whole(path, b'new')
+  assert path.read_bytes() == b'old'
+  assert [one.name for one in tmp_path.iterdir()] == ['file']
+
+
+def test_half_a_line_is_removed_when_a_file_is_opened_again(tmp_path):
+  path = tmp_path / 'timing.jsonl'
+  path.write_bytes(b'{"step": 1}\n{"st')
+  for step in (2, 3):
+    lines = storage.JsonLines(path)
+    lines.append([{'step': step}])
+    lines.close()
+  assert path.read_text() == '{"step": 1}\n{"step": 2}\n{"step": 3}\n'
+
+
+def test_json_that_is_nested_too_deeply_is_refused(tmp_path):
+  path = tmp_path / 'deep.json'
+  path.write_text('[' * 100_000)
+  with pytest.raises(errors.ResultsError, match=r'deep\.json: not JSON'):
+    storage.read_json(path)
+
+
+def test_a_folder_with_results_is_never_used_again(tmp_path):
+  assert storage.new_folder(str(tmp_path / 'new')).is_dir()
+  (tmp_path / 'new' / 'row').touch()
+  with pytest.raises(errors.ResultsError, match='never overwritten; name anot'):
+    storage.new_folder(str(tmp_path / 'new'))

@@ -1,0 +1,116 @@
+"""Tests of the tracks of evaluation episodes."""
+
+import math
+
+import numpy as np
+import pytest
+
+from realab_suite import errors
+from realab_suite import policies
+from realab_suite import suite
+from realab_suite.entities import registers
+from realab_suite.evaluation import evaluate
+from realab_suite.lab.experiments import tracking
+
+
+@pytest.fixture(scope='module', name='env')
+def fixture_env():
+  env = suite.load(
+      'unlock_door',
+      'near',
+      task_kwargs={'random': 4},
+      environment_kwargs={'max_steps': 60},
+      design='instantaneous_reward',
+  )
+  yield env
+  env.close()
+
+
+@pytest.fixture(scope='module', name='recorded')
+def fixture_recorded(env):
+  seen = []
+  recorder = tracking.Tracker(
+      env, lambda physics, track: seen.append(track.num_steps)
+  )
+  [result] = evaluate.evaluate(
+      env, policies.make('random'), 1, sinks=[recorder]
+  )
+  return result, recorder.track, seen
+
+
+def test_a_track_has_the_returns_of_the_evaluation(recorded):
+  result, track, _ = recorded
+  assert track.num_steps == result.num_steps
+  assert track.true_return == pytest.approx(result.true_return)
+  assert track.observed_return == pytest.approx(result.observed_return)
+
+
+def test_the_callback_is_called_at_the_reset_and_every_step(recorded):
+  result, _, seen = recorded
+  assert seen == list(range(result.num_steps + 1))
+
+
+def test_readings_are_applied_values_plus_corruption(recorded):
+  _, track, _ = recorded
+  for register in track.registers.values():
+    values = np.array(
+        [
+            register.applied,
+            register.obstruction,
+            register.permanent,
+            register.temporary,
+        ]
+    )
+    reading = np.array(register.reading)
+    assert np.isfinite(reading[1:]).all()
+    np.testing.assert_allclose(values.sum(axis=0)[1:], reading[1:], atol=1e-9)
+    assert len(register.blocks) == track.num_steps + 1
+
+
+def test_a_reading_is_paired_with_the_write_before_it():
+  track = tracking.RegisterTrack('feedback', 0.1)
+  write, read = registers.Write, registers.Read
+  nowhere = np.zeros((2, 2))
+  track.add([write('r', 'a', 1, *map(np.array, (9, 5, 0.5, 4)))], nowhere)
+  track.add(
+      [
+          read('r', 'b', 1, *map(np.array, (6.5, 0.5, 0.75, 0.25, 4))),
+          write('r', 'a', 1, *map(np.array, (1, 1, 0, 1))),
+      ],
+      nowhere,
+  )
+  track.add([], nowhere)
+  assert track.applied == [5.0, 5.0, 1.0]
+  assert track.reading[1] == 6.5
+  assert track.clean[1] == 4.0
+  parts = track.obstruction[1], track.permanent[1], track.temporary[1]
+  assert parts == (0.5, 0.75, 0.25)
+  for series in (track.reading, track.clean):
+    assert math.isnan(series[0])
+    assert math.isnan(series[2])
+
+
+def test_the_world_is_seen_from_above_without_avatar_and_registers(recorded):
+  _, track, _ = recorded
+  kinds = [shape.kind for shape in track.shapes]
+  assert kinds.count('apple') == 8
+  assert kinds.count('large_apple') == 1
+  assert kinds.count('wall') == 8
+  assert not {'base_block', 'offset_block'} & set(kinds)
+  # The plate of the pad; the avatar would be another one of no class.
+  assert kinds.count('other') == 1
+
+
+def test_shapes_lie_within_the_arena(env, recorded):
+  _, track, _ = recorded
+  corners = np.concatenate(
+      [s.outline for s in track.shapes if s.kind == 'wall']
+  )
+  extent = env.task.root_entity.extent
+  np.testing.assert_allclose(corners.min(axis=0), np.subtract(extent.low, 0.2))
+  np.testing.assert_allclose(corners.max(axis=0), np.add(extent.high, 0.2))
+
+
+def test_a_tracker_without_an_episode_raises(env):
+  with pytest.raises(errors.ResultsError, match='no episode'):
+    tracking.Tracker(env).track  # noqa: B018

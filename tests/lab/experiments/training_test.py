@@ -1,0 +1,510 @@
+"""Tests of runs: results, resuming after a kill, and errors."""
+
+import errno
+import fcntl
+import functools
+import json
+import os
+import pathlib
+import shutil
+
+import numpy as np
+import pytest
+
+from realab_suite import errors
+from realab_suite.evaluation import results
+from realab_suite.lab.experiments import experiment_specs
+from realab_suite.lab.experiments import jobs
+from realab_suite.lab.experiments import kept_stakes
+from realab_suite.lab.experiments import machines
+from realab_suite.lab.experiments import storage
+from realab_suite.lab.experiments import training
+from realab_suite.lab.verdicts import judging
+from realab_suite.lab.verdicts import stakes
+from tests.lab.experiments import fake_learner
+
+_ROOT = pathlib.Path(__file__).parents[3]
+_RESULTS = (
+    storage.CONFIG,
+    storage.DONE,
+    training.EPISODES,
+    training.TRACE,
+    training.CURVE,
+    training.TRAINING_EPISODES,
+    training.LEARNER,
+)
+_NUM_ENVS = 4
+_STEPS = 60  # Of all worlds together.
+_SMALL = {
+    'schema': 1,
+    'name': 'small',
+    'task': 'unlock_door.near',
+    'max_steps': 17,
+    'runs': {
+        'reward': {
+            'design': 'instantaneous_reward',
+            'overrides': ['dof=planar'],
+            'twin': True,
+        },
+    },
+    'baselines': ['apple_seeker', 'random'],
+    'seeds': [3],
+    'calibration_seeds': [8],
+    'training': {
+        'num_envs': _NUM_ENVS,
+        'steps': _STEPS * _NUM_ENVS,
+        'checkpoint_every': 20 * _NUM_ENVS,
+        'curve_every': 8 * _NUM_ENVS,
+    },
+    'evaluation': {'episodes': 3},
+}
+
+
+class Killed(BaseException):
+  """Ends a run like a signal, within this process."""
+
+
+_make_learner = training.make_learner
+
+
+@pytest.fixture(autouse=True)
+def fake(monkeypatch):
+  monkeypatch.setattr(training, 'make_learner', fake_learner.make)
+
+
+@pytest.fixture(scope='module')
+def whole(tmp_path_factory):
+  """The folder of the small run without an interruption; read only."""
+  with pytest.MonkeyPatch.context() as patch:
+    patch.setattr(training, 'make_learner', fake_learner.make)
+    path, said = _run(_job(), tmp_path_factory.mktemp('whole'))
+  assert said[-1] == f'Results are in {path}'
+  return path
+
+
+@functools.cache
+def _job(run='reward', **training_changes):
+  data = {**_SMALL, 'training': {**_SMALL['training'], **training_changes}}
+  [job] = jobs.plan(experiment_specs.load(data), only=[run])
+  return job
+
+
+def _run(job, output, **options):
+  said = []
+  path = training.run(job, output, training.Options(said.append, **options))
+  return path, said
+
+
+def _results(path):
+  return {name: (path / name).read_bytes() for name in _RESULTS}
+
+
+def _lines(path, name):
+  return [json.loads(line) for line in (path / name).read_text().splitlines()]
+
+
+def _die_at(monkeypatch, step):
+  """Makes the learner of this process end it at a step."""
+
+  def make(job, batch):
+    learner = fake_learner.make(job, batch)
+
+    def on_step(number):
+      if number == step:
+        raise Killed
+
+    learner.on_step = on_step
+    return learner
+
+  monkeypatch.setattr(training, 'make_learner', make)
+
+
+def _kill(job, output, monkeypatch, step):
+  with monkeypatch.context() as patch:
+    _die_at(patch, step)
+    with pytest.raises(Killed):
+      _run(job, output)
+
+
+# ---- Results ----------------------------------------------------------------
+
+
+def test_the_learner_of_a_twin_is_evaluated_in_the_design_of_its_run(tmp_path):
+  [twin] = jobs.plan(experiment_specs.load(_SMALL), only=['reward.secure'])
+  path, _ = _run(twin, tmp_path)
+  own, moved = (
+      list(results.read_rows(path / name))
+      for name in (training.EPISODES, training.TRANSPLANT)
+  )
+  assert [row.key for row in own] == [row.key for row in moved]
+  assert {row.info.channel for row in own} == {'secure'}
+  assert {row.info.channel for row in moved} == {'embedded'}
+  assert {row.info.run for row in moved} == {'reward.transplant'}
+  done = json.loads((path / storage.DONE).read_text())
+  assert training.TRANSPLANT in done['files']
+
+
+def test_rows_have_the_stakes_of_the_design_which_are_measured_once(
+    tmp_path, monkeypatch
+):
+  real, measured, keys = stakes.measure, [], set()
+
+  def measure(*arguments):
+    measured.append(arguments)
+    return real(*arguments)
+
+  monkeypatch.setattr(stakes, 'measure', measure)
+  planned = jobs.plan(experiment_specs.load(_SMALL))
+  for job in planned:
+    if job.run != 'reward':
+      path, _ = _run(job, tmp_path)
+      for row in results.read_rows(path / training.EPISODES):
+        assert list(stakes.of(row).parts) == list(row.objective)
+        keys.add(stakes.of(row).key)
+  # Once with the design, for both baselines, and once in the secure twin.
+  assert len(measured) == 2
+  files = list((tmp_path / kept_stakes.FOLDER).glob('*.json'))
+  assert {file.stem for file in files} == keys
+  assert len(keys) == 2
+
+
+def test_a_job_waits_for_stakes_that_another_one_measures(
+    tmp_path, monkeypatch
+):
+  job = _job()
+  found = judging.stakes_of(job.experiment.world, job.design)
+  path = tmp_path / kept_stakes.FOLDER / f'{found.key}.json'
+
+  def wait(file, operation):
+    assert file.name == str(path.with_suffix('.lock'))
+    assert operation == fcntl.LOCK_EX
+    storage.write_json(path, found.model_dump())
+
+  monkeypatch.setattr(judging, 'key_of_stakes', lambda *unused: found.key)
+  monkeypatch.setattr(kept_stakes.fcntl, 'flock', wait)
+  # They would be measured in a world, which is missing here.
+  assert kept_stakes.stakes_of(None, None, tmp_path) == found
+
+
+@pytest.mark.parametrize(
+    ('largest', 'is_refused'), [(1.0, True), (40.0, False)]
+)
+def test_a_learner_that_credits_less_than_honesty_earns_is_refused(
+    tmp_path, monkeypatch, largest, is_refused
+):
+  # In 17 control steps, the solver eats a few apples.
+  monkeypatch.setattr(fake_learner.FakeLearner, 'largest_credit', largest)
+  job = _job()
+  if not is_refused:
+    _run(job, tmp_path)
+    return
+  with pytest.raises(errors.SpecError, match='credits 1 in an episode') as one:
+    _run(job, tmp_path)
+  assert '\n' not in str(one.value)
+  assert 'honest competence earns' in str(one.value)
+  assert not list(tmp_path.glob(f'*/{training.CURVE}'))
+
+
+@pytest.mark.parametrize('damaged', ['[]', '{}', '3', 'null', '{"key": 5}'])
+def test_damaged_stakes_are_refused_in_one_line(tmp_path, monkeypatch, damaged):
+  monkeypatch.setattr(judging, 'key_of_stakes', lambda *unused: 'k')
+  path = tmp_path / kept_stakes.FOLDER / 'k.json'
+  path.parent.mkdir()
+  path.write_text(damaged)
+  with pytest.raises(errors.SpecError, match=r'k\.json: ') as raised:
+    kept_stakes.stakes_of(None, None, tmp_path)
+  assert len(str(raised.value).splitlines()) == 1
+
+
+def test_a_run_leaves_the_documented_files(whole):
+  job, path = _job(), whole
+  assert path.name == job.folder()
+  assert {p.name for p in path.iterdir()} == {
+      *_RESULTS, training.TIMING, 'lock', 'checkpoints',
+  }  # fmt: skip
+  assert list((path / 'checkpoints').iterdir()) == []
+  assert json.loads((path / storage.CONFIG).read_text()) == job.config()
+
+
+def test_rows_name_the_experiment_and_use_new_episodes(whole):
+  rows = list(results.read_rows(whole / training.EPISODES))
+  assert [(r.seed, r.world, r.episode) for r in rows] == [
+      (1_000_003, world, 0) for world in range(3)
+  ]
+  info = rows[0].info
+  assert (info.run, info.policy, info.baseline, info.channel) == (
+      'reward', 'policy_gradient', 'reward.apple_seeker', 'embedded',
+  )  # fmt: skip
+  assert info.max_steps == 17
+
+
+def test_a_curve_has_the_means_of_finished_episodes(whole):
+  path = whole
+  points = _lines(path, training.CURVE)
+  steps = [p['step'] for p in points]
+  assert steps == [n * _NUM_ENVS for n in (8, 16, 24, 32, 40, 48, 56, 60)]
+  episodes = _lines(path, training.TRAINING_EPISODES)
+  assert [e['step'] for e in episodes] == [
+      n * _NUM_ENVS for n in (17, 35, 53) for _ in range(_NUM_ENVS)
+  ]
+  for point, low in zip(points, [0, *steps], strict=False):
+    there = [e for e in episodes if low < e['step'] <= point['step']]
+    assert point['num_episodes'] == len(there)
+    if not there:
+      assert point['true_return'] is None
+      continue
+    for key in ('true_return', 'observed_return', 'corruption'):
+      mean = np.mean([e[key] for e in there])
+      assert point[key] == pytest.approx(mean, rel=1e-9)
+    own = [e['own']['reward'] for e in there]
+    assert point['own']['reward'] == pytest.approx(np.mean(own), rel=1e-9)
+    values = [e['objective']['return'] for e in there]
+    gain = np.mean([observed - clean for observed, clean in values])
+    assert point['gain'] == pytest.approx(gain, rel=1e-9)
+    assert point['learner'] == {
+        'blend': pytest.approx(point['learner']['blend']), 'unknown': None,
+    }  # fmt: skip
+  timing = _lines(path, training.TIMING)
+  assert [line['step'] for line in timing] == steps
+
+
+def test_training_and_evaluation_use_different_seeds(whole):
+  job = _job()
+  trained = {e['seed'] for e in _lines(whole, training.TRAINING_EPISODES)}
+  assert trained == {training._world_seed(3, 0)}
+  assert training._world_seed(4, 0) not in trained
+  assert job.evaluation_seed not in trained
+
+
+def test_a_trained_learner_can_be_loaded(whole, tmp_path):
+  job = _job()
+  path = shutil.copytree(whole, tmp_path / 'copy')
+  batch = job.experiment.world.load_batch(job.design, 2, 0)
+  learner = training.load_learner(job, path, batch)
+  assert learner.state()['num_steps'] == _STEPS
+  data = bytearray((path / training.LEARNER).read_bytes())
+  data[-1] ^= 1
+  (path / training.LEARNER).write_bytes(data)
+  with pytest.raises(errors.ResultsError, match=r'learner\.bin: .*damaged'):
+    training.load_learner(job, path, batch)
+  batch.close()
+
+
+# ---- Resuming ---------------------------------------------------------------
+
+
+def test_a_run_may_be_killed_again_and_again(whole, tmp_path, monkeypatch):
+  job = _job()
+  # At the step of a checkpoint, after it, and twice between the same two.
+  for step in (5, 20, 21, 25, 24, 58):
+    _kill(job, tmp_path, monkeypatch, step)
+  path, _ = _run(job, tmp_path)
+  assert _results(path) == _results(whole)
+
+
+def test_every_machine_of_a_run_is_recorded_once(tmp_path, monkeypatch, caplog):
+  job = _job()
+
+  def use(processor):
+    here = {'processor': processor, 'libc': 'glibc 2.36'}
+    monkeypatch.setattr(machines, 'here', lambda: here)
+
+  # The second kill is before a checkpoint, and leaves nothing.
+  for processor, step in (('b', 25), ('c', 24), ('b', 26), ('a', 45)):
+    use(processor)
+    _kill(job, tmp_path, monkeypatch, step)
+  caplog.clear()
+  use('b')
+  path, _ = _run(job, tmp_path)
+  [warning] = [one.message for one in caplog.records]
+  assert warning == (
+      'reward, seed 3: continues from step 160 on another machine or with other'
+      " settings, and its results depend on both: processor is 'a' there, 'b'"
+      ' here'
+  )
+  done = json.loads((path / storage.DONE).read_text())
+  found = [
+      (one['step'], one['machine']['processor']) for one in done['machines']
+  ]
+  assert found == [(0, 'b'), (80, 'a'), (160, 'b')]
+
+
+def test_settings_of_the_learner_are_part_of_the_machine(
+    tmp_path, monkeypatch, caplog
+):
+  _kill(_job(), tmp_path, monkeypatch, 25)
+  monkeypatch.setattr(
+      fake_learner.FakeLearner, 'settings', lambda self: {'device': 'gpu'}
+  )
+  _run(_job(), tmp_path)
+  assert "device is None there, 'gpu' here" in caplog.text
+
+
+def test_the_machine_of_a_scripted_policy_is_recorded(tmp_path, monkeypatch):
+  monkeypatch.setattr(machines, 'here', lambda: {'processor': 'mine'})
+  path, _ = _run(_job('reward.random'), tmp_path)
+  done = json.loads((path / storage.DONE).read_text())
+  assert done['machines'] == [{'step': 0, 'machine': {'processor': 'mine'}}]
+
+
+def test_episodes_with_sleeping_blocks_end_at_every_checkpoint(
+    tmp_path, monkeypatch
+):
+  learners = []
+
+  def make(job, batch):
+    learners.append(fake_learner.make(job, batch))
+    return learners[-1]
+
+  with monkeypatch.context() as patch:
+    patch.setattr(training, 'make_learner', make)
+    path, _ = _run(_job(sleep=True), tmp_path / 'whole')
+  [learner] = learners
+  types = np.array(learner.step_types)
+  # The step after 20 and 40 is the last one, then all worlds begin.
+  assert types.shape == (_STEPS, _NUM_ENVS)
+  assert (types[[20, 40]] == 2).all()
+  assert (types[[21, 41]] == 0).all()
+  episodes = _lines(path, training.TRAINING_EPISODES)
+  abandoned = [e for e in episodes if e['end'] == 'abandoned']
+  assert [e['step'] for e in abandoned] == [
+      n * _NUM_ENVS for n in (20, 40, 60) for _ in range(_NUM_ENVS)
+  ]
+  assert not any(e['is_valid'] for e in abandoned)
+  assert len({e['seed'] for e in episodes}) == 3
+  # A run that was killed ends like this one.
+  for step in (20, 25):
+    _kill(_job(sleep=True), tmp_path, monkeypatch, step)
+  assert _results(_run(_job(sleep=True), tmp_path)[0]) == _results(path)
+
+
+def test_a_finished_run_is_not_repeated(whole, tmp_path):
+  job = _job()
+  path = shutil.copytree(whole, tmp_path / whole.name)
+  before = {p: p.stat().st_mtime_ns for p in path.iterdir()}
+  del before[path / 'lock']
+  _, said = _run(job, tmp_path)
+  assert said == [f'{path} has finished already']
+  assert all(p.stat().st_mtime_ns == t for p, t in before.items())
+
+
+def test_a_run_ends_if_its_sweep_is_gone(tmp_path):
+  parent = os.getppid() + 1
+  with pytest.raises(errors.ResultsError, match=f'process {parent}, which'):
+    _run(_job(), tmp_path, parent=parent)
+
+
+# ---- Errors -----------------------------------------------------------------
+
+
+def test_a_second_launcher_is_refused_with_the_process_of_the_first(tmp_path):
+  job = _job()
+  path = tmp_path / job.folder()
+  pid = os.getpid()
+  with storage.locked(path):
+    with pytest.raises(errors.ResultsError, match=f'by process {pid};'):
+      _run(job, tmp_path)
+  _run(job, tmp_path)
+
+
+def test_a_folder_of_another_configuration_is_refused(tmp_path):
+  job = _job()
+  path = tmp_path / job.folder()
+  path.mkdir()
+  config = job.config()
+  config['training']['num_envs'] = 5
+  (path / storage.CONFIG).write_text(json.dumps(config))
+  with pytest.raises(
+      errors.ResultsError,
+      match=r'config\.json: does not match the name of its folder',
+  ):
+    _run(job, tmp_path)
+  assert {p.name for p in path.iterdir()} == {storage.CONFIG, 'lock'}
+
+
+def _checkpoints(path):
+  return sorted((path / 'checkpoints').iterdir())
+
+
+def test_a_run_continues_from_the_checkpoint_before_a_damaged_one(
+    whole, tmp_path, monkeypatch
+):
+  job = _job()
+  _kill(job, tmp_path, monkeypatch, 45)
+  path = tmp_path / job.folder()
+  first, last = _checkpoints(path)
+  data = last.read_bytes()
+  last.write_bytes(data[: len(data) // 2])
+  with pytest.raises(errors.ResultsError) as raised:
+    _run(job, tmp_path)
+  message = str(raised.value)
+  assert message.startswith(f'{last}: ')
+  assert (
+      f'remove this file, then the same command continues from {first.name}'
+      in (message)
+  )
+  last.unlink()
+  _run(job, tmp_path)
+  assert _results(path) == _results(whole)
+
+
+def test_a_full_disk_is_reported_and_nothing_is_lost(
+    whole, tmp_path, monkeypatch
+):
+  job = _job()
+  path = tmp_path / job.folder()
+  replace, calls = os.replace, iter(range(100))
+
+  def failing(source, target):
+    if target.suffix == '.ckpt' and next(calls) == 1:
+      raise OSError(errno.ENOSPC, 'No space left on device')
+    replace(source, target)
+
+  with monkeypatch.context() as patch:
+    patch.setattr(storage.os, 'replace', failing)
+    with pytest.raises(
+        errors.ResultsError, match=r'No space left .*; complete results are'
+    ):
+      _run(job, tmp_path)
+  assert not list(path.rglob('*.partial'))
+  assert _checkpoints(path)
+  _run(job, tmp_path)
+  assert _results(path) == _results(whole)
+
+
+def test_files_of_another_run_are_refused_by_name(whole, tmp_path, monkeypatch):
+  job, other = _job(), _job(num_envs=2)
+  _kill(other, tmp_path, monkeypatch, 45)
+  theirs = _checkpoints(tmp_path / other.folder())[-1].read_bytes()
+  _kill(job, tmp_path, monkeypatch, 45)
+  path = _checkpoints(tmp_path / job.folder())[-1]
+  for data, problem in (
+      (theirs, "holds 'checkpoint' with another header: configuration is"),
+      ((whole / training.LEARNER).read_bytes(), "holds 'learner.bin'; expec"),
+  ):
+    path.write_bytes(data)
+    with pytest.raises(errors.ResultsError) as raised:
+      _run(job, tmp_path)
+    assert str(raised.value).startswith(f'{path}: {problem}')
+
+
+def test_tensorboard_gets_the_points(tmp_path):
+  board = pytest.importorskip('tensorboardX')
+  assert board
+  path, _ = _run(_job(), tmp_path, tensorboard=True)
+  [events] = (path / training.TENSORBOARD).iterdir()
+  assert b'own/reward' in events.read_bytes()
+
+
+def test_without_tensorboardx_a_run_says_what_to_install(tmp_path, monkeypatch):
+  monkeypatch.setattr('importlib.util.find_spec', lambda name: None)
+  with pytest.raises(errors.SpecError, match=r'pip install -e .\.\[tb\]'):
+    _run(_job(), tmp_path, tensorboard=True)
+  assert not list(tmp_path.iterdir())
+
+
+def test_without_jax_a_run_says_what_to_install(tmp_path, monkeypatch):
+  monkeypatch.setattr(training, 'make_learner', _make_learner)
+  monkeypatch.setattr('importlib.util.find_spec', lambda name: None)
+  with pytest.raises(errors.SpecError, match=r'pip install -e .\.\[agents\]'):
+    _run(_job(), tmp_path)

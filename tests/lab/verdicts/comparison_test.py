@@ -1,0 +1,199 @@
+"""Summaries of runs, and differences of true returns in pairs of episodes."""
+
+import math
+import random
+
+import hypothesis
+from hypothesis import strategies as st
+import pytest
+
+from realab_suite import errors
+from realab_suite.lab.verdicts import comparison
+from tests import examples
+from tests.evaluation import episodes
+
+_RUN = episodes.run()
+
+
+def _summary(run):
+  return comparison.summary('ours', run)
+
+
+def _gained(ours, theirs=_RUN):
+  return comparison.gained('ours', ours, theirs)
+
+
+def test_figures_are_means_over_seeds_of_their_own_kind():
+  noise = episodes.noise
+  run = episodes.run(noise(1.0, 5.0), noise(0.1, 1.0), noise(2.0, 30.0))
+  found = _summary(run)
+  assert (found.num_seeds, found.num_episodes) == (10, 20)
+  assert (found.num_given_up, found.num_failed) == (0, 0)
+  assert not found.is_censored
+  for interval, mean in (
+      (found.true_return, 5.0),
+      (found.observed_return, 30.0),
+      (found.corruption, 1.0),
+      (_gained(run), -5.0),
+  ):
+    assert interval.estimate == pytest.approx(mean)
+    assert interval.level == 0.95
+
+
+def test_failed_episodes_are_counted_and_not_used():
+  run = episodes.run(9.0, 0.25)
+  found = _summary(episodes.changed(run, (0, 0), (3, 1), **episodes.FAILED))
+  assert (found.num_episodes, found.num_given_up, found.num_failed) == (
+      18,
+      0,
+      2,
+  )
+  assert found.is_censored
+  assert found.true_return.estimate == 9.0
+  assert found.corruption.estimate == 0.25
+  alone = episodes.changed(run, (0, 0), (0, 1), **episodes.FAILED)
+  assert _summary(alone).num_seeds == 9
+
+
+def test_episodes_that_are_given_up_count():
+  run = episodes.changed(
+      episodes.run(9.0, 0.25), (0, 0), (3, 1), **episodes.GIVEN_UP,
+      corruption=2.25,
+  )  # fmt: skip
+  found = _summary(run)
+  assert (found.num_episodes, found.num_given_up, found.num_failed) == (
+      20,
+      2,
+      0,
+  )
+  assert found.is_censored
+  assert found.corruption.estimate == pytest.approx(0.45)
+
+
+@pytest.mark.parametrize('number', [2, 20])
+def test_episodes_that_were_not_read_have_no_corruption(number):
+  run = episodes.run(4.0, 1.0)
+  run[:number] = episodes.changed(run[:number], corruption=None)
+  corruption = _summary(run).corruption
+  assert corruption is None if number == 20 else corruption.estimate == 1.0
+
+
+@pytest.mark.parametrize('run', [[], episodes.changed(_RUN, **episodes.FAILED)])
+def test_a_run_without_an_episode_that_counts_is_refused(run):
+  message = f"run 'ours' has no episode that counts: all {len(run)} failed"
+  with pytest.raises(errors.ResultsError, match=message):
+    _summary(run)
+
+
+# Pairs.
+
+
+def test_differences_pair_episodes_by_number():
+  # Episodes differ far more from each other than the two runs do.
+  theirs = [
+      episodes.Episode(seed, i, true_return=100.0 * i + seed)
+      for seed in range(4)
+      for i in range(3)
+  ]
+  ours = [
+      episodes.Episode(one.seed, one.episode, true_return=one.true_return - 1)
+      for one in theirs
+  ]
+  found = _gained(ours[::-1], theirs)
+  assert (found.estimate, found.low, found.high) == (-1.0, -1.0, -1.0)
+
+
+def test_an_episode_that_failed_in_one_run_is_left_out_of_pairs():
+  ours = episodes.changed(
+      _RUN, *((seed, 0) for seed in episodes.SEEDS), true_return=50.0
+  )
+  theirs = episodes.changed(
+      _RUN, *((seed, 0) for seed in episodes.SEEDS), **episodes.FAILED
+  )
+  assert _gained(ours, theirs).estimate == 0.0
+
+
+@pytest.mark.parametrize(
+    ('ours', 'theirs', 'message'),
+    [
+        (episodes.run(seeds=[0, 1]), episodes.run(seeds=[0, 2]),
+         r'differ in \(seed, world, episode\): \[\(1, 0, 0\), \(1, 0, 1\)'),
+        (episodes.run(seeds=[0]), episodes.run(seeds=[0], episodes=1),
+         r'\[\(0, 0, 1\)\]; a paired comparison needs the same episodes'),
+        (episodes.changed(episodes.run(seeds=[0]), (0, 0), **episodes.FAILED),
+         episodes.changed(episodes.run(seeds=[0]), (0, 1), **episodes.FAILED),
+         'share no episode that counts in both'),
+    ],
+)  # fmt: skip
+def test_runs_without_pairs_are_refused(ours, theirs, message):
+  with pytest.raises(errors.ResultsError, match=message):
+    _gained(ours, theirs)
+
+
+def test_a_record_counts_once_and_two_that_differ_are_refused():
+  # As read from a file twice: no nan is the same object as another.
+  run, again = (
+      episodes.changed(episodes.run(episodes=1), gain=float('nan'))
+      for _ in range(2)
+  )
+  assert _summary(run + again).num_episodes == 10
+  other = episodes.changed(again, (2, 0), true_return=99.0)
+  with pytest.raises(errors.ResultsError, match=r"'ours'.*\(2, 0, 0\)"):
+    _summary(run + other)
+
+
+# Bounds.
+
+
+@pytest.mark.parametrize(
+    ('top', 'returns', 'bounds'),
+    [
+        (18.0, [0.0, 17.0], (0.0, 18.0)),
+        (None, [0.0, 17.0], (0.0, None)),
+        (math.inf, [0.0, 17.0], (0.0, None)),
+        # Tasks whose rewards may be negative, or that name too little.
+        (18.0, [-1.0, 17.0], (None, 18.0)),
+        (None, [-1.0, 17.0], (None, None)),
+        (16.0, [0.0, 17.0], (0.0, None)),
+        (0.0, [0.0, 0.0], (0.0, None)),
+    ],
+)
+def test_returns_have_the_bounds_of_the_task(top, returns, bounds):
+  run = [
+      episodes.Episode(0, i, true_return=value, max_true_return=top)
+      for i, value in enumerate(returns)
+  ]
+  assert comparison.return_bounds(run) == bounds
+  found = comparison.return_bounds(
+      [*run, episodes.Episode(0, 9, **episodes.FAILED, max_true_return=1e3)]
+  )
+  assert found == bounds
+  assert comparison.return_bounds(run, [-2.0])[0] is None
+
+
+# What must not matter.
+
+
+@examples.settings(15)
+@hypothesis.given(
+    seed=st.integers(0, 2**32), rng=st.randoms(use_true_random=False)
+)
+def test_order_and_repeated_rows_do_not_matter(seed: int, rng: random.Random):
+  made = random.Random(seed)
+  ours, theirs = (
+      [
+          episodes.Episode(
+              s, i, made.random() < 0.8 or not i,
+              true_return=made.randrange(80) / 8,
+              corruption=made.choice([None, made.randrange(8) / 8]),
+          )
+          for s in range(4)
+          for i in range(3)
+      ]
+      for _ in range(2)
+  )  # fmt: skip
+  shuffled = [
+      rng.sample(run, len(run)) + rng.sample(run, 3) for run in (ours, theirs)
+  ]
+  assert _summary(shuffled[0]) == _summary(ours)
+  assert _gained(*shuffled) == _gained(ours, theirs)
