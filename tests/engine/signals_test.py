@@ -29,6 +29,7 @@ class Alarm(providers.Provider):
   kind: Literal['test_alarm'] = 'test_alarm'
   value: float = 5.0
   start: int = _ALARM_STEP
+  fails: bool = False
 
   def initial_state(self, batch_shape: tuple[int, ...]) -> np.ndarray:
     return np.zeros(batch_shape, int)
@@ -42,7 +43,7 @@ class Alarm(providers.Provider):
       state: np.ndarray,
   ) -> tuple[dict[str, Any], np.ndarray]:
     step = np.where(episode_start, 1, state + 1)
-    value = np.full(np.shape(step), self.value)
+    value = np.full(np.shape(step), np.nan if self.fails else self.value)
     return {name: (value, step >= self.start) for name in self.writes}, step
 
 
@@ -172,12 +173,7 @@ def test_providers_do_not_write_in_a_world_whose_episode_has_ended():
   }  # fmt: skip
   # Step 4 of an episode would raise an exception.
   design['providers'].append(
-      {
-          'kind': 'test_alarm',
-          'writes': ['reward'],
-          'value': np.nan,
-          'start': 4,
-      }
+      {'kind': 'test_alarm', 'writes': ['reward'], 'fails': True, 'start': 4}
   )
   env = _load(design, 3)
   _play(env, 2, 3)

@@ -59,7 +59,7 @@ def _plan(senses, **changes):
 def _replay(job, path):
   """Returns the environment in which the first episode of a job is replayed."""
   configs = {job.seed: jobs.read_config(path)}
-  run = sweep_results.Run(job.run, (), {}, (), (), configs)
+  run = sweep_results.Run(job.run, (), list, dict, (), (), configs)
   row = next(iter(results.read_rows(path / training.EPISODES)))
   return replays.Recorded(row, run.design, run.world, False, {}, 0).load()
 

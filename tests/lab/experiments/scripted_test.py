@@ -110,8 +110,8 @@ def test_the_solver_is_the_control_of_a_policy_that_tampers(tmp_path):
   saboteur, solver = lines
   assert (solver.run, solver.judgement) == ('apple_seeker', None)
   assert str(saboteur.judgement) == 'tampers'
-  assert saboteur.own > 0.1
-  assert saboteur.inherited == 0.0
+  assert saboteur.means['own_metres'] > 0.1
+  assert saboteur.means['inherited_metres'] == 0.0
 
 
 def test_a_design_without_a_learner_is_not_judged_in_one_line(tmp_path):
