@@ -5,6 +5,7 @@ import re
 
 import pytest
 
+from realab_suite.doors.browser import person
 from realab_suite.engine import events
 from tests.engine import helpers
 from tests.feedback import tampered
@@ -30,7 +31,7 @@ def _moved(*names, step=3):
 
 
 _ASKED_PERSON = {
-    'kind': 'person', 'asks': 'approval', 'reads': ['query'],
+    'kind': person.KIND, 'asks': 'approval', 'reads': ['query'],
     'writes': ['reward'], 'answers': 'live', 'waits': True,
 }  # fmt: skip
 _CHAIN = tampered.design(_NOTE, _adding(['clock'], 'note'), _adding(['note']))
@@ -108,7 +109,7 @@ def test_an_example_of_clean_contents_is_correct(world_of, row):
   ]
   world = world_of('single', design)
   for provider in world.mechanism.design.providers:
-    if provider.kind == 'person':
+    if provider.kind == person.KIND:
       provider.source.connect(lambda question: 1.0)
   sink = helpers.RecordingSink()
   world.env.add_sink(sink)

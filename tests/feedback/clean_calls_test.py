@@ -10,6 +10,7 @@ import pytest
 
 from realab_suite import suite
 from realab_suite import trees
+from realab_suite.doors.browser import person
 from realab_suite.feedback import clean_contents
 from realab_suite.feedback import providers
 from realab_suite.feedback import specs
@@ -209,7 +210,7 @@ def test_negligible_is_small_in_metres_and_beside_the_range(
 
 
 def _person(answers, **options):
-  return {'kind': 'person', 'asks': 'approval', 'reads': ['query'],
+  return {'kind': person.KIND, 'asks': 'approval', 'reads': ['query'],
           'writes': ['reward'], 'answers': answers, 'waits': True,
           'options': options}  # fmt: skip
 
@@ -225,8 +226,8 @@ def test_what_a_person_wrote_is_clean(world_of, monkeypatch):
     asked.append(int(question.query))
     return float(question.query)
 
-  person = world.mechanism.design.providers[0]
-  person.source.connect(answer)
+  provider = world.mechanism.design.providers[0]
+  provider.source.connect(answer)
   moves = [Move(2, 'query', 3.0), Move(3, 'reward', 5.0)]
   found = world.run(moves, 4, 'query', 'reward', query=1.0)
   assert asked == [1, 4, 4, 4]  # Once in each step.

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from realab_suite.config import loading
+from realab_suite.doors.browser import person
 from realab_suite.feedback import providers
 from realab_suite.feedback import specs
 from tests.config import refusals
@@ -349,12 +350,12 @@ def test_a_silent_provider_stays_silent(shape: tuple[int, ...]):
 
 
 def test_it_needs_what_the_provider_that_it_pays_for_needs():
-  person: Any = {
-      'kind': 'person', 'asks': 'correction', 'writes': ('r',),
+  corrections: Any = {
+      'kind': person.KIND, 'asks': 'correction', 'writes': ('r',),
       'answers': 'simulated',
   }  # fmt: skip
   provider = _make(
-      pays=person, reads=('moved', 'budget'), writes=('r', 'budget')
+      pays=corrections, reads=('moved', 'budget'), writes=('r', 'budget')
   )
   alone = provider.pays
   assert provider.required_senses == alone.required_senses != ()
@@ -362,7 +363,7 @@ def test_it_needs_what_the_provider_that_it_pays_for_needs():
   assert provider.action_writes == ('r',)
   assert provider.is_repeatable
   live = _make(
-      pays={**person, 'answers': 'live'},
+      pays={**corrections, 'answers': 'live'},
       reads=('moved', 'budget'),
       writes=('r', 'budget'),
   )

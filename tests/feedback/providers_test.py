@@ -10,6 +10,7 @@ import pytest
 
 from realab_suite import policies
 from realab_suite import testing
+from realab_suite.doors.browser import person
 from realab_suite.feedback import providers
 from realab_suite.policies import action_sets
 from realab_suite.policies import random_keys
@@ -87,9 +88,9 @@ _CASES: list[tuple[str, dict[str, Any]]] = [
         'reads': ('query', 'score')}),
     ('paired_advice', {**_REWARD, 'value_function': 'apple_seeker_approval',
         'reads': ('query', 'score'), 'tolerance': 0.0}),
-    ('person', {**_ADVICE, 'asks': 'approval'}),
-    ('person', {**_ADVICE, 'asks': 'comparison', 'clip': 1, 'waits': True}),
-    ('person', {**_REWARD, 'asks': 'correction'}),
+    (person.KIND, {**_ADVICE, 'asks': 'approval'}),
+    (person.KIND, {**_ADVICE, 'asks': 'comparison', 'clip': 1, 'waits': True}),
+    (person.KIND, {**_REWARD, 'asks': 'correction'}),
     ('inspection', {'reads': ('moved', 'budget'), 'period': 2, 'lasts': 2,
         'writes': ('alarm', 'budget'), 'false_negatives': 0.3}),
     ('inspection', {'reads': ('score', 'a', 'b', 'budget'), 'penalty': 2.0,
@@ -311,7 +312,7 @@ def test_paired_advice_writes_the_difference_of_two_values(
 
 def test_providers_declare_the_reads_that_are_actions():
   for kind, fields in _CASES:
-    queries = kind in ('value_advice', 'paired_advice', 'person')
+    queries = kind in ('value_advice', 'paired_advice', person.KIND)
     expected = fields.get('reads', ()) if queries else ()
     assert _make(kind, **fields).action_queries == expected
 

@@ -15,14 +15,14 @@ import numpy as np
 
 from realab_suite import errors
 from realab_suite import worlds
+from realab_suite.doors.browser import answer_sources
+from realab_suite.doors.browser import person
 from realab_suite.doors.browser import servers
 from realab_suite.doors.browser import views
 from realab_suite.engine import environment
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import results
-from realab_suite.feedback.providers import answer_sources
-from realab_suite.feedback.providers import person
 from realab_suite.lab.experiments import evaluations
 from realab_suite.lab.experiments import storage
 from realab_suite.lab.experiments import tracking

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from realab_suite.doors.browser import person
 from realab_suite.policies import action_sets
 
 _SIZES: dict[str, Any] = {'kind': 'two_block', 'scale': 0.1}
@@ -30,8 +31,8 @@ def design(
     clip: Length of the clips of a comparison, in control steps.
     action_set: Actions of the agent.
   """
-  person = {
-      'kind': 'person', 'answers': source, 'options': options or {},
+  asked = {
+      'kind': person.KIND, 'answers': source, 'options': options or {},
       'action_set': action_set.key,
   }  # fmt: skip
   last = len(action_set) - 1
@@ -49,12 +50,12 @@ def design(
       },
   }  # fmt: skip
   question = {
-      **person, 'asks': asks, 'writes': ['feedback'], 'waits': waits,
+      **asked, 'asks': asks, 'writes': ['feedback'], 'waits': waits,
       'clip': clip,
       'every': 1 if asks == 'comparison' else every,
       'reads': [] if asks == 'correction' else ['query'],
   }  # fmt: skip
-  stop = {**person, 'asks': 'stop', 'reads': ['query'], 'writes': ['stop']}
+  stop = {**asked, 'asks': 'stop', 'reads': ['query'], 'writes': ['stop']}
   return {
       'schema': 1,
       'name': f'person_{asks}',

@@ -12,6 +12,5 @@ from realab_suite.feedback.providers.difference import Difference
 from realab_suite.feedback.providers.growth import Growth
 from realab_suite.feedback.providers.inspection import Inspection
 from realab_suite.feedback.providers.paired_advice import PairedAdvice
-from realab_suite.feedback.providers.person import Person
 from realab_suite.feedback.providers.relay import Relay
 from realab_suite.feedback.providers.value_advice import ValueAdvice

@@ -8,6 +8,7 @@ import pytest
 from realab_suite import errors
 from realab_suite import suite
 from realab_suite import worlds
+from realab_suite.doors.browser import person
 from realab_suite.evaluation import gains
 from realab_suite.feedback import providers
 from realab_suite.feedback import specs
@@ -233,7 +234,7 @@ _INSTRUMENTS = worlds.World('unlock_door', 'near').instruments
 _METERED = 'meters.0.measures={{kind: {}, {}}}'
 _PERSON = {
     **designs.ADVISED,
-    'providers': [{'kind': 'person', 'asks': 'approval', 'reads': ['query'],
+    'providers': [{'kind': person.KIND, 'asks': 'approval', 'reads': ['query'],
                    'writes': ['reward'], 'answers': 'live'}],
 }  # fmt: skip
 

@@ -1,7 +1,7 @@
 """A person as feedback provider (paper, section 3.1)."""
 
 import functools
-from typing import Annotated, Any, Literal, final
+from typing import Annotated, Any, Final, Literal, final
 
 import numpy as np
 import pydantic
@@ -10,13 +10,16 @@ from realab_suite import errors
 from realab_suite import policies
 from realab_suite.config import messages
 from realab_suite.config import option_types
-from realab_suite.feedback.providers import answer_sources
+from realab_suite.doors.browser import answer_sources
 from realab_suite.feedback.providers import base
 from realab_suite.feedback.providers import queries
 from realab_suite.policies import action_sets
 
+KIND: Final = 'person'
+"""Kind of the provider in designs; this module registers it."""
 
-@base.PROVIDERS.add('person')
+
+@base.PROVIDERS.add(KIND)
 @final
 class Person(base.Provider):
   """Provider that writes the answers of a person.

@@ -8,9 +8,9 @@ import pytest
 from realab_suite import errors
 from realab_suite import policies
 from realab_suite import suite
+from realab_suite.doors.browser import answer_sources
 from realab_suite.doors.browser import supervised_designs
 from realab_suite.evaluation import evaluate
-from realab_suite.feedback.providers import answer_sources
 from tests.engine import helpers
 
 _EXACT = {'latency': 0, 'noise': 0.0, 'fatigue': 0.0}
