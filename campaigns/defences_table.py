@@ -3,7 +3,7 @@
 Run from the root of the repository, with a picture to draw and the folders of
 sweeps of reward learning with and without defences, such as `defences`:
 
-    python -m campaigns.defences_table docs/images/defences.png results/defences
+    python -m campaigns.defences_table table.png docs/results/defences
 
 It prints a line for each run, and the best and the worst world of a design that
 ran in several. Runs are compared with reward learning without a defence,

@@ -405,7 +405,7 @@ def _connected(
   )
   with contextlib.ExitStack() as stack:
     stack.callback(env.close)
-    host.check_placement(env.physics, mechanism)
+    env.check_placement()
     stack.pop_all()
   return env
 

@@ -14,6 +14,8 @@ import yaml
 from pictures import notebooks
 from realab_suite import errors
 from realab_suite import suite
+from realab_suite.doors.browser import person
+from realab_suite.feedback import providers
 from realab_suite.feedback import specs
 from realab_suite.lab.experiments import experiment_specs
 from realab_suite.lab.experiments import jobs
@@ -148,6 +150,7 @@ def _yaml_blocks():
 def test_designs_and_experiments_in_pages_can_be_loaded(
     text, tmp_path, monkeypatch
 ):
+  assert person.KIND in providers.PROVIDERS  # A page has a design with it.
   monkeypatch.chdir(tmp_path)
   (tmp_path / 'answers.jsonl').touch()  # Those that a person has given.
   content = yaml.safe_load(text)

@@ -320,12 +320,18 @@ class Space:
     )
 
   def at(self, state: np.ndarray) -> mujoco.MjData:
-    """Returns the data of the copy in an integration state, `(size,)`."""
+    """Returns the data of the copy in an integration state, `(size,)`.
+
+    Poses of geoms are those of another state until `update`.
+    """
     mujoco.mj_setState(
         self._model, self._data, state, mujoco.mjtState.mjSTATE_INTEGRATION
     )
-    mujoco.mj_kinematics(self._model, self._data)
     return self._data
+
+  def update(self) -> None:
+    """Computes the poses of geoms in the state of the copy."""
+    mujoco.mj_kinematics(self._model, self._data)
 
   def meetings(
       self, blocks: Shapes, others: Shapes

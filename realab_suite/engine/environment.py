@@ -92,6 +92,16 @@ class Environment(composer.Environment):
 
   # The interface for evaluators and launchers. Agents do not get this object.
 
+  def check_placement(self) -> None:
+    """Checks the places of registers, before the first episode.
+
+    Raises:
+      SpecError: If something is in the way of a register.
+    """
+    self._host.check_placement(
+        self._physics, self._mechanism, self._start_check
+    )
+
   @property
   def mechanism(self) -> mechanisms.FeedbackMechanism:
     """Registers, meters and providers."""

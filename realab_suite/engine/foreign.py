@@ -177,8 +177,9 @@ class ForeignHost(hosts.Host):
     )
 
   def check_placement(
-      self, physics: Any, mechanism: mechanisms.FeedbackMechanism
+      self, physics: Any, mechanism: mechanisms.FeedbackMechanism, start: Any
   ) -> None:
+    del start
     placement.check(physics, self._task.root_entity, mechanism)
 
   def start_check(

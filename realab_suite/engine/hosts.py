@@ -185,9 +185,14 @@ class Host(abc.ABC):
 
   @abc.abstractmethod
   def check_placement(
-      self, physics: Any, mechanism: mechanisms.FeedbackMechanism
+      self, physics: Any, mechanism: mechanisms.FeedbackMechanism, start: Any
   ) -> None:
     """Checks the places of registers in a newly compiled world.
+
+    Args:
+      physics: Physics of one world, whose state is reset.
+      mechanism: Registers, meters and providers.
+      start: Result of `start_check` for the same physics.
 
     Raises:
       SpecError: If something is in the way of a register.
@@ -415,10 +420,10 @@ class WorldHost(Host):
     return composer_observation.Updater({})
 
   def check_placement(
-      self, physics: Any, mechanism: mechanisms.FeedbackMechanism
+      self, physics: Any, mechanism: mechanisms.FeedbackMechanism, start: Any
   ) -> None:
-    placement.check(physics, self._task.root_entity, mechanism)
-    placement.check_start(physics, self._task, mechanism)
+    placement.check(physics, self._task.root_entity, mechanism, start)
+    placement.check_start(physics, self._task, mechanism, start.space)
 
   def start_check(
       self, physics: Any, mechanism: mechanisms.FeedbackMechanism

@@ -31,6 +31,7 @@ def check(
     physics: mjcf.Physics,
     root: composer.Entity,
     mechanism: mechanisms.FeedbackMechanism,
+    start: 'StartCheck | None' = None,
 ) -> None:
   """Checks the places of registers in a newly compiled world.
 
@@ -41,6 +42,7 @@ def check(
     physics: Physics of one world.
     root: Root entity.
     mechanism: Registers, meters and providers.
+    start: Check of the starts of episodes, which has measured the same world.
 
   Raises:
     SpecError: If a block could leave the arena, be inside an immovable object
@@ -48,8 +50,9 @@ def check(
       the solver lets meters affect bodies that they do not touch.
   """
   _check_solver(physics, mechanism)
-  space = clearance.Space(physics.model.ptr)
+  space = start.space if start else clearance.Space(physics.model.ptr)
   named = mechanism.registers
+  posed = start.poses if start else {}
   clearance.settle(physics, named.values())
   # Planes are the ground, or are placed when an episode begins, as in corridors
   # of dm_control.
@@ -58,7 +61,10 @@ def check(
   obstacles = _along_ways(physics, root, space.shapes(physics.data, mask))
   placed: list[clearance.Shapes] = []
   for name, register in named.items():
-    blocks = clearance.poses(physics, register, register.spread)
+    if name in posed and not register.spread.any():
+      blocks = posed[name]
+    else:
+      blocks = clearance.poses(physics, register, register.spread)
     _check_extent(name, blocks, root)
     _check_support(name, blocks, space)
     for i, j in space.meetings(blocks, obstacles):
@@ -82,6 +88,7 @@ def check_start(
     physics: mjcf.Physics,
     task: base.Task,
     mechanism: mechanisms.FeedbackMechanism,
+    space: clearance.Space,
 ) -> None:
   """Checks that no episode begins with something movable inside a block.
 
@@ -93,12 +100,12 @@ def check_start(
     physics: Physics of one world.
     task: Task of this package.
     mechanism: Registers, meters and providers.
+    space: Copy of the compiled model.
 
   Raises:
     SpecError: If a block could overlap the avatar or another body when an
       episode begins.
   """
-  space = clearance.Space(physics.model.ptr)
   clearance.settle(physics, mechanism.registers.values())
   movable = _movable(physics, task, mechanism, space)
   bodies = space.shapes(physics.data, movable)
@@ -138,6 +145,11 @@ class StartCheck:
   A task may move walls and other parts at the start of an episode, and put
   bodies somewhere. The check costs next to nothing in worlds where all parts
   are where the compiled model has them.
+
+  Attributes:
+    space: Copy of the compiled model.
+    poses: Blocks of registers along their paths, in the middle of their
+      regions, by name; empty in worlds in which nothing can be in their way.
   """
 
   def __init__(
@@ -155,7 +167,7 @@ class StartCheck:
     """
     self._design = mechanism.design.name
     self._root = task.root_entity
-    self._space = space = clearance.Space(physics.model.ptr)
+    self.space = space = clearance.Space(physics.model.ptr)
     self._movable = _movable(physics, task, mechanism, space)
     carriers = physics.model.body_weldid[physics.model.geom_bodyid]
     self._is_part = physics.model.body_mocapid[carriers] >= 0
@@ -164,15 +176,20 @@ class StartCheck:
     # Each register, the geom of its first block, where that begins, and where
     # all of its blocks are written then.
     self._registers: list[tuple[Any, int, np.ndarray, clearance.Shapes]] = []
+    self.poses: dict[str, clearance.Shapes] = {}
     self._homes = space.shapes(physics.data, self._is_part)
+    data = physics.data
+    self._mocap = np.array(data.mocap_pos), np.array(data.mocap_quat)
     bodies = space.shapes(physics.data, self._movable)
     if not len(self._homes.geoms) + len(bodies.geoms):
       return
     clearance.settle(physics, mechanism.registers.values())
     homes = np.array(physics.data.geom_xpos)
-    for register in mechanism.registers.values():
+    for name, register in mechanism.registers.items():
       first = int(physics.bind(register.blocks[0].geom).element_id)
-      blocks = clearance.poses(physics, register, np.zeros(2))
+      blocks = self.poses[name] = clearance.poses(
+          physics, register, np.zeros(2)
+      )
       self._registers.append((register, first, homes[first], blocks))
     physics.reset()
 
@@ -188,9 +205,13 @@ class StartCheck:
     """
     if not self._registers:
       return
-    data = self._space.at(physics.state)
-    bodies = self._space.shapes(data, self._movable)
-    parts = self._space.shapes(data, self._is_part)
+    data = self.space.at(physics.state)
+    mocap = data.mocap_pos, data.mocap_quat
+    if not self._movable.any() and all(map(np.array_equal, mocap, self._mocap)):
+      return
+    self.space.update()
+    bodies = self.space.shapes(data, self._movable)
+    parts = self.space.shapes(data, self._is_part)
     is_moved = (parts.centres != self._homes.centres).any(axis=1)
     is_moved |= (parts.axes != self._homes.axes).any(axis=(1, 2))
     if not len(bodies.geoms) + is_moved.sum():
@@ -208,7 +229,7 @@ class StartCheck:
       self, register: Any, blocks: clearance.Shapes, others: clearance.Shapes
   ) -> None:
     """Raises an error if a block of a register is inside something."""
-    for i, j in self._space.meetings(blocks, others):
+    for i, j in self.space.meetings(blocks, others):
       raise composer.EpisodeInitializationError(
           f'design {self._design!r}: register {register.name!r}'
           f' {blocks.describe(i)}, inside {others.names[j]!r} when the episode'

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 import functools
-import pathlib
 from typing import Any
 
 from dm_control import composer
@@ -170,18 +169,6 @@ def test_what_a_task_observes_does_not_depend_on_registers_nearby(name: str):
       np.testing.assert_allclose(
           beside[key], value, rtol=1e-3, atol=1e-3, err_msg=key
       )
-
-
-def test_the_table_of_the_documentation_lists_the_tested_tasks():
-  names = []
-  for domain in ('locomotion', 'manipulation'):
-    [[_, tested]] = helpers.rows_of_page('doors.md', domain, 2)
-    names += tested.split('; ')
-  assert names == list(embedded.COMPOSER_TASKS)
-  [name] = _WITHOUT_REGISTERS
-  page = pathlib.Path(__file__).parents[2] / 'docs' / 'doors.md'
-  text = page.read_text(encoding='utf-8')
-  assert f'the {name} is refused with registers' in text
 
 
 def test_a_batch_is_refused_with_the_remedy():

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterator, Mapping
 import contextlib
 import copy
-import pathlib
 import struct
 from typing import Any
 
@@ -207,17 +206,6 @@ def spec_text(env: Any) -> str:
           env.discount_spec(),
       ]
   )
-
-
-def rows_of_page(page: str, text: str, num_cells: int) -> list[list[str]]:
-  """Returns the cells of table rows in docs/ that contain a cell of text."""
-  lines = (pathlib.Path(__file__).parents[2] / 'docs' / page).read_text()
-  tables = [
-      [cell.strip() for cell in line.strip('|').split('|')]
-      for line in lines.splitlines()
-      if line.startswith('|')
-  ]
-  return [row for row in tables if text in row and len(row) == num_cells]
 
 
 def random_actions(env: Any, number: int, seed: int = 0) -> list[np.ndarray]:
