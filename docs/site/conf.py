@@ -56,7 +56,6 @@ autodoc_inherit_docstrings = False
 # Packages of extras that the site does without.
 autodoc_mock_imports = [
     'minari',
-    'pyarrow',
     'stable_baselines3',
 ]
 napoleon_use_ivar = True
