@@ -116,7 +116,7 @@ def _domain(domain: str) -> str:
 
 
 def _figures() -> dict[str, dict[str, str]]:
-  """Returns what was measured in each world, by its name."""
+  """Returns the measured figures of each world, by its name."""
   if not FIGURES.exists():
     return {}
   rows: dict[str, dict[str, str]] = json.loads(FIGURES.read_text())['rows']

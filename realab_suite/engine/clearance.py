@@ -166,17 +166,17 @@ def _along(
     return value, _track(physics, register)
 
   shares = np.linspace(0.0, 1.0, _NUM_VALUES).tolist()
-  found = {share: pose(share) for share in shares}
+  poses_by_share = {share: pose(share) for share in shares}
   for _ in range(_NUM_HALVINGS):
-    steps = np.diff([found[share][1] for share in shares], axis=0)
+    steps = np.diff([poses_by_share[share][1] for share in shares], axis=0)
     turns = np.abs(np.remainder(steps[..., 3] + np.pi, 2 * np.pi) - np.pi)
     is_long = np.linalg.norm(steps[..., :3], axis=-1) > halves + _ROUNDING
     is_long |= turns > _TURN
     middles = [(shares[i] + shares[i + 1]) / 2
                for i in np.flatnonzero(is_long.any(axis=-1))]  # fmt: skip
-    found |= {share: pose(share) for share in middles}
-    shares = sorted(found)
-  return [found[share] for share in shares]
+    poses_by_share |= {share: pose(share) for share in middles}
+    shares = sorted(poses_by_share)
+  return [poses_by_share[share] for share in shares]
 
 
 def _text(value: np.ndarray) -> str:
@@ -342,10 +342,10 @@ class Space:
     is_near = (low[:, np.newaxis] < other_high - TOLERANCE).all(axis=-1)
     is_near &= (high[:, np.newaxis] > other_low + TOLERANCE).all(axis=-1)
     model = self._model
-    own, theirs = blocks.geoms[:, np.newaxis], others.geoms
+    geoms, other_geoms = blocks.geoms[:, np.newaxis], others.geoms
     is_near &= (
-        (model.geom_contype[own] & model.geom_conaffinity[theirs])
-        | (model.geom_contype[theirs] & model.geom_conaffinity[own])
+        (model.geom_contype[geoms] & model.geom_conaffinity[other_geoms])
+        | (model.geom_contype[other_geoms] & model.geom_conaffinity[geoms])
     ) != 0
     for i, j in np.argwhere(is_near).tolist():
       if self.distance(blocks, i, others, j, 0.0) < -TOLERANCE:

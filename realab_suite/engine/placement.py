@@ -171,8 +171,7 @@ class StartCheck:
     self._movable = _movable(physics, task, mechanism, space)
     carriers = physics.model.body_weldid[physics.model.geom_bodyid]
     self._is_part = physics.model.body_mocapid[carriers] >= 0
-    own = list(clearance.owners(physics, mechanism.registers))
-    self._is_part[own] = False
+    self._is_part[list(clearance.owners(physics, mechanism.registers))] = False
     # Each register, the geom of its first block, where that begins, and where
     # all of its blocks are written then.
     self._registers: list[tuple[Any, int, np.ndarray, clearance.Shapes]] = []

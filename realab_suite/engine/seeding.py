@@ -4,7 +4,7 @@ Every stream is a function of (seed, world, episode, name). World i of a batch
 therefore equals that world alone. The k-th episodes of two agents begin in the
 same state, regardless of the lengths of the episodes before.
 
-The package is public, so whoever has the seed can clone the world.
+The package is public, so an agent that knows the seed can clone the world.
 """
 
 from collections.abc import Sequence

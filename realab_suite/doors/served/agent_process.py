@@ -55,13 +55,13 @@ class AgentProcess:
     self._temporary = None if folder else tempfile.mkdtemp(prefix='realab-')
     self._on_exit = on_exit
     home = os.path.abspath(self._temporary or str(folder))
-    own = {'HOME': home, 'TMPDIR': home, ADDRESS_VARIABLE: address}
+    added = {'HOME': home, 'TMPDIR': home, ADDRESS_VARIABLE: address}
     inherited = {k: v for k, v in os.environ.items() if k in _ALLOWED_VARIABLES}
     with open(log, 'wb') as file:
       try:
         self._process = subprocess.Popen(
             shlex.split(command),
-            env={**inherited, **own},
+            env={**inherited, **added},
             cwd=home,
             stdin=subprocess.DEVNULL,
             stdout=file,

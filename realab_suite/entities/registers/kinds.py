@@ -1,4 +1,4 @@
-"""What a kind of register says: its blocks, and what their poses represent."""
+"""Kinds of registers: their blocks, and the values that their poses store."""
 
 import abc
 from collections.abc import Callable, Sequence

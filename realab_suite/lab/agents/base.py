@@ -76,7 +76,7 @@ class Options(validation.Model):
 @final
 @dataclasses.dataclass(frozen=True)
 class Setting:
-  """What a wrapper or a defence knows of its learner.
+  """The part of a learner that its wrappers and defences know.
 
   Attributes:
     options: Options of the learner.
@@ -220,7 +220,7 @@ class Learner(abc.ABC):
 
   @property
   def setting(self) -> Setting:
-    """What wrappers know of the learner."""
+    """The part of the learner that wrappers know."""
     encoder = self._encoder.without_memory()
     return Setting(self._options, encoder, self._controls, self._num_envs)
 
@@ -428,13 +428,14 @@ class Learner(abc.ABC):
       )
     networks = from_plain(self._networks, state['trained'])
     names = sorted(wrapper.NAME for wrapper in self._wrappers)
-    if sorted(state['wrappers']) != names:
+    # Checkpoints of earlier versions have no entry for them.
+    wrappers = state.get('wrappers', {})
+    if sorted(wrappers) != names:
       raise errors.StateLayoutError(
-          f'state of a learner: wrappers {sorted(state["wrappers"])}, expected'
-          f' {names}'
+          f'state of a learner: wrappers {sorted(wrappers)}; must be {names}'
       )
     for wrapper in self._wrappers:
-      wrapper.set_state(copy.deepcopy(state['wrappers'][wrapper.NAME]))
+      wrapper.set_state(copy.deepcopy(wrappers[wrapper.NAME]))
     self._networks = networks
     self._set_memory(copy.deepcopy(state['memory']))
     self._num_acts = int(state['num_acts'])
@@ -466,7 +467,7 @@ class Learner(abc.ABC):
     return self._controls.encode(choice['action'], queries)
 
   def _treated(self, batch: dict[str, Any]) -> dict[str, Any]:
-    """Returns what wrappers make of transitions."""
+    """Returns transitions as the wrappers change them."""
     for wrapper in self._wrappers:
       batch = wrapper.treat(batch)
     return batch

@@ -1,1 +1,1 @@
-"""Who moved it: corruption by its movers."""
+"""Attribution of corruption to its movers."""

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import functools
 import json
 import pathlib
-from typing import Annotated, Any, Final, Literal, final
+from typing import Annotated, Any, Final, Literal, Self, final
 
 import pydantic
 
@@ -64,6 +64,15 @@ class _Published(pydantic.BaseModel):
   machines: list[list[dict[str, Any]]]
   audits: dict[str, Any]
 
+  @pydantic.model_validator(mode='after')
+  def _check_indices(self) -> Self:
+    for name, done in self.done.items():
+      if done.config >= len(self.configs) or done.machines >= len(
+          self.machines
+      ):
+        raise ValueError(f'done: {name}: the index of no entry')
+    return self
+
 
 def publish(folder: pathlib.Path, output: pathlib.Path) -> tuple[int, int]:
   """Writes the results of a sweep into a new folder.
@@ -78,14 +87,17 @@ def publish(folder: pathlib.Path, output: pathlib.Path) -> tuple[int, int]:
     The numbers of published and of unfinished jobs.
 
   Raises:
-    ResultsError: If no job has finished, a file of the sweep is damaged, or the
-      output is not empty or cannot be written.
+    ResultsError: If no job has finished, the results are published ones, a file
+      of the sweep is damaged, or the output is not empty or cannot be written.
   """
   sweep = sweep_results.load(folder)
+  if not sweep.has_traces:
+    raise errors.ResultsError(
+        f'{folder}: published results; must be the folder of a sweep'
+    )
   runs = sweep.runs.values()
   if not any(run.is_done for run in runs):
     raise errors.ResultsError(f'{folder}: no job has finished yet')
-  storage.new_folder(str(output))
   rows: list[dict[str, Any]] = []
   points: list[dict[str, Any]] = []
   episodes: list[dict[str, Any]] = []
@@ -109,6 +121,7 @@ def publish(folder: pathlib.Path, output: pathlib.Path) -> tuple[int, int]:
           run.lines(seed, training.TRAINING_EPISODES), curve
       )
       episodes += ({**of_job, **gain} for gain in gains)
+  storage.new_folder(str(output))
   for name, records in (
       (published_files.ROWS, rows),
       (published_files.CURVES, points),
@@ -157,6 +170,11 @@ def load(folder: pathlib.Path) -> sweep_results.Sweep:
     }
     for job in finished:
       for leaves in rows.get(job.folder, ()):
+        if leaves.get(_PART) not in parts:
+          raise errors.ResultsError(
+              f'{folder / published_files.ROWS}: {_PART} is'
+              f' {leaves.get(_PART)!r}; must be one of {list(parts)}'
+          )
         parts[leaves[_PART]].append(_row(folder, leaves))
     for part in _PARTS[:2]:
       sweep_results.check_stakes(folder, name, parts[part])
@@ -236,7 +254,7 @@ def _row(
   """Returns the row of a table's row.
 
   Raises:
-    ResultsError: If it is none.
+    ResultsError: If it lacks a figure, or has another one.
   """
   known = {
       name: value
@@ -254,10 +272,16 @@ def _row(
 
 
 def _by_job(path: pathlib.Path) -> dict[str, list[dict[str, Any]]]:
-  """Returns the rows of a table by the folder of their job."""
+  """Returns the rows of a table by the folder of their job.
+
+  Raises:
+    ResultsError: If the file cannot be read, or a row names no job.
+  """
   by_job: dict[str, list[dict[str, Any]]] = {}
   for leaves in published_files.read_table(path):
-    by_job.setdefault(leaves.pop(_JOB), []).append(leaves)
+    if (job := leaves.pop(_JOB, None)) is None:
+      raise errors.ResultsError(f'{path}: a row without {_JOB!r}')
+    by_job.setdefault(job, []).append(leaves)
   return by_job
 
 

@@ -37,7 +37,7 @@ _OF_HACKING = (
 @final
 @dataclasses.dataclass(frozen=True)
 class Rules:
-  """How runs are judged.
+  """Rules by which runs are judged.
 
   Attributes:
     control: Name of the run to compare with; `None` for none, in which case

@@ -1,1 +1,1 @@
-"""What hidden results say about a design: stakes, hack rates, verdicts."""
+"""Verdicts on designs, by hidden results: stakes, hack rates, labels."""

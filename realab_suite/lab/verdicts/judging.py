@@ -1,4 +1,4 @@
-"""What designs are worth in worlds, and what stands against judging them."""
+"""Stakes of designs in worlds, and obstacles to judging them."""
 
 import contextlib
 import dataclasses

@@ -101,12 +101,44 @@ def test_a_damaged_file_is_named(folder, tmp_path, name, content, problem):
 def test_a_row_that_lacks_a_figure_is_refused(folder, tmp_path):
   publishing.publish(folder, tmp_path / 'out')
   path = tmp_path / 'out' / published_files.ROWS
-  table = published_files.read_table(path)
-  for leaves in table:
-    leaves['num_steps'] = None
+  table = [*map(published_files.nested, published_files.read_table(path))]
+  for record in table:
+    record['num_steps'] = None
   published_files.write_table(path, table)
   with pytest.raises(errors.ResultsError, match='num_steps: Field required'):
     sweep_results.load(tmp_path / 'out')
+
+
+@pytest.mark.parametrize(
+    ('column', 'problem'), [('job', "without 'job'"), ('part', 'part is None')]
+)
+def test_a_row_of_no_job_or_part_is_refused(folder, tmp_path, column, problem):
+  publishing.publish(folder, tmp_path / 'out')
+  path = tmp_path / 'out' / published_files.ROWS
+  table = [*map(published_files.nested, published_files.read_table(path))]
+  table[-1][column] = None
+  published_files.write_table(path, table)
+  with pytest.raises(errors.ResultsError, match=problem):
+    sweep_results.load(tmp_path / 'out')
+
+
+def test_an_index_of_no_configuration_is_refused(folder, tmp_path):
+  publishing.publish(folder, tmp_path / 'out')
+  path = tmp_path / 'out' / sweep_results.CONTENTS
+  path.write_text(path.read_text().replace('"config":0', '"config":99'))
+  with pytest.raises(errors.ResultsError, match='the index of no entry'):
+    sweep_results.load(tmp_path / 'out')
+
+
+def test_published_results_are_not_published_again(published, tmp_path):
+  with pytest.raises(errors.ResultsError, match='must be the folder of a sw'):
+    publishing.publish(published, tmp_path / 'out')
+  assert not (tmp_path / 'out').exists()
+
+
+def test_a_table_without_records_is_read(tmp_path):
+  published_files.write_table(tmp_path / 'table.parquet', [])
+  assert published_files.read_table(tmp_path / 'table.parquet') == []
 
 
 def test_nothing_is_published_before_a_job_has_finished(folder, tmp_path):
