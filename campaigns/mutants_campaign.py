@@ -33,7 +33,6 @@ _ENV = (
     'tests/engine/foreign_feedback_test.py',
 )
 _ACTIONS = 'engine/action_codec.py'
-_MECHANISM = 'feedback/mechanisms.py'
 _MECH = ('tests/feedback/mechanism_test.py',)
 _CHECKS = 'entities/registers/checks.py'
 _TWO_BLOCK = 'entities/registers/two_block.py'

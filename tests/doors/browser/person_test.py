@@ -69,11 +69,6 @@ def test_latency_delays_answers_and_nothing_else_is_asked_meanwhile():
   assert [value is not None for value in found] == [False, False, True] * 3
 
 
-def test_noise_makes_answers_wrong():
-  right, wrong = _simulate(40), _simulate(40, noise=1.0)
-  assert right == [-value for value in wrong]
-
-
 def test_fatigue_makes_a_person_silent_more_and_more_often():
   found = _simulate(400, fatigue=0.02)
   silent = [value is None for value in found]
@@ -128,9 +123,8 @@ def test_a_person_who_compares_reads_a_query():
     _evaluate('random', design)
 
 
-@pytest.mark.parametrize('asks', ['approval', 'correction', 'comparison'])
-def test_a_batch_gets_the_answers_of_single_worlds(asks):
-  design = supervised_designs.design(asks, options={'noise': 0.3})
+def test_a_batch_gets_the_answers_of_single_worlds():
+  design = supervised_designs.design('comparison', options={'noise': 0.3})
   arguments = 'unlock_door', 'near', {'random': 1}
   kwargs = {'max_steps': 30}
   batch = suite.load_batch(*arguments, kwargs, num_envs=2, design=design)

@@ -79,22 +79,19 @@ def test_messages_go_both_ways_and_others_are_dropped(server):
     assert connection.recv(timeout=patience.SECONDS) == b'\x02jpeg'
 
 
-@pytest.mark.parametrize('target', ['http://[::1?token=', '//[/?token='])
-def test_a_malformed_request_is_refused_without_a_traceback(
-    server, target, caplog
-):
+def test_a_malformed_request_is_refused_without_a_traceback(server, caplog):
   address = parse.urlsplit(server.url)
   with socket.create_connection((address.hostname, address.port)) as raw:
     raw.settimeout(patience.SECONDS)
-    raw.sendall(f'GET {target} HTTP/1.1\r\n'.encode() + _UPGRADE)
+    raw.sendall(b'GET http://[::1?token= HTTP/1.1\r\n' + _UPGRADE)
     assert raw.recv(4096).startswith(b'HTTP/1.1 400 ')
   assert not [one for one in caplog.records if one.exc_info]
 
 
-@pytest.mark.parametrize('text', ['[' * 4_000, '{"a":' * 800, '1' * 4_000])
-def test_a_message_that_cannot_be_parsed_is_dropped(server, text):
+def test_messages_that_cannot_be_parsed_are_dropped(server):
   with _connect(server) as connection:
-    connection.send(text)
+    for text in ('[' * 4_000, '{"a":' * 800, '1' * 4_000):
+      connection.send(text)
     connection.send('{"type": "run"}')
     message = server.receive(60.0)  # Not longer: a failure never answers.
   assert message == {'type': 'run'}

@@ -1,20 +1,14 @@
 """Tests of the addresses of servers: sockets and ports."""
 
-import os
 import re
 import socket
-import subprocess
-import sys
 import threading
 
 import pytest
 
 from realab_suite import errors
 from realab_suite.doors.served import agent_server
-from tests import patience
 from tests.doors.served import served
-
-_PYTHON = sys.executable
 
 
 @pytest.fixture(name='serving', scope='module')
@@ -48,11 +42,6 @@ def test_a_wrong_address_is_refused(address):
     agent_server.Server(_Nothing(), address).start()
 
 
-def test_a_folder_that_cannot_be_created_is_refused():
-  with pytest.raises(errors.SpecError, match='cannot create folder /proc/x'):
-    agent_server.Server(_Nothing(), 'unix:/proc/x/socket').start()
-
-
 def test_an_address_in_use_is_refused(serving):
   with pytest.raises(errors.SpecError, match='is in use'):
     agent_server.Server(_Nothing(), serving.address).start()
@@ -81,36 +70,3 @@ def test_a_port_of_this_machine_can_be_served():
   stream.close()
   server.stop()
   thread.join()
-
-
-def test_an_interrupted_answer_does_not_block_the_exit(tmp_path):
-  # Python waits for the threads of pools when it ends.
-  program = f"""
-import threading
-from realab_suite.doors.served import agent_server
-from tests.doors.served import addresses_test, served
-def interrupt(request):
-  raise KeyboardInterrupt
-world = addresses_test._Nothing()
-world.answer = interrupt
-made = agent_server.Server(world, 'unix:{tmp_path}/s/socket')
-made.start()
-stream = served.RawStream(made.address)
-threading.Thread(target=stream.ask, args=(b'x',), daemon=True).start()
-try:
-  made.run()
-except KeyboardInterrupt:
-  raise SystemExit(7)
-"""
-  ran = subprocess.run(
-      [_PYTHON, '-c', program], cwd=served.ROOT, timeout=patience.SECONDS,
-      check=False, stderr=subprocess.DEVNULL,
-  )  # fmt: skip
-  assert ran.returncode == 7
-
-
-def test_a_server_does_not_survive_a_fork(tmp_path, monkeypatch):
-  made = agent_server.Server(_Nothing(), f'unix:{tmp_path}/s/socket')
-  monkeypatch.setattr(os, 'getpid', lambda: -1)
-  with pytest.raises(errors.ForkError):
-    made.run()

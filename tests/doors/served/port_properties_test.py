@@ -5,10 +5,8 @@ import re
 from typing import Any
 
 from dm_env_rpc.v1 import dm_env_rpc_pb2 as pb
-from dm_env_rpc.v1 import tensor_utils
 import hypothesis
 from hypothesis import strategies as st
-import numpy as np
 import pytest
 
 from realab_suite.doors.served import refusals
@@ -17,7 +15,6 @@ from tests import examples
 from tests.doors.served import served
 
 _MAX_STEPS = 20
-_MAX_UINT64 = 2**64 - 1
 _Reason = refusals.Reason
 _FAILED = _Reason.FAILED.value[1]
 _TEXTS = [
@@ -93,29 +90,9 @@ def _mutated(draw: Any) -> bytes:
   return bytes(message)
 
 
-@st.composite
-def _wrong_steps(draw: Any) -> bytes:
-  """Draws a step with parts of the right kinds, most of them wrong."""
-  size = draw(st.sampled_from([0, 1, 5, 6, 6, 6, 7, 100]))
-  values = np.zeros(size)
-  if size:
-    values[draw(st.integers(0, size - 1))] = draw(
-        st.sampled_from([0.0, 1.0, -1.0, 1.5, np.nan, np.inf, 1e300])
-    )
-  dtype = draw(st.sampled_from(['f8', 'f8', 'f4', 'i4', 'u1', '?']))
-  with np.errstate(invalid='ignore', over='ignore'):
-    tensor = tensor_utils.pack_tensor(values.astype(dtype))
-  if draw(st.booleans()):
-    tensor.shape[:] = draw(st.lists(st.integers(-1, 2**31 - 1), max_size=3))
-  uid = draw(st.sampled_from([1, 1, 1, 0, 2, _MAX_UINT64]))
-  uids = draw(st.lists(st.integers(0, 12) | st.just(_MAX_UINT64), max_size=4))
-  step = pb.StepRequest(actions={uid: tensor}, requested_observations=uids)
-  return served.request(step=step)
-
-
-@examples.settings(400)
+@examples.settings(100)
 @hypothesis.given(
-    message=_mutated() | _wrong_steps() | st.binary(max_size=40),
+    message=_mutated() | st.binary(max_size=40),
     before=st.sampled_from([served.JOIN, served.STEP]),
 )
 def test_any_message_has_an_allowed_answer(
@@ -123,19 +100,3 @@ def test_any_message_has_an_allowed_answer(
 ):
   port.answer(before)
   _check(_ask(port, message))
-
-
-@examples.settings(200)
-@hypothesis.given(uid=st.integers(0, 300) | st.integers(0, _MAX_UINT64))
-def test_observations_of_the_spec_are_all_that_there_is(
-    port: served_world.ServedWorld, uid: int
-):
-  port.answer(served.LEAVE)
-  joined = _ask(port, served.JOIN).join_world.specs.observations
-  step = pb.StepRequest(requested_observations=[uid], actions=served.ACTION)
-  answer = _ask(port, served.request(step=step))
-  if uid in joined:
-    assert list(answer.step.observations) == [uid]
-    assert answer.step.observations[uid].shape == joined[uid].shape
-  else:
-    assert answer.error.message == f'observation {uid} is unknown'

@@ -4,8 +4,6 @@ from collections.abc import Callable, Iterator
 import contextlib
 import pathlib
 import queue
-import subprocess
-import sys
 import tempfile
 import threading
 from typing import Any, NamedTuple
@@ -122,51 +120,17 @@ def in_thread(
       thread.join(patience.SECONDS)
 
 
-class Program(NamedTuple):
-  """A server as a program of its own."""
-
-  address: str
-  process: subprocess.Popen[str]
-
-
-@contextlib.contextmanager
-def in_process(
-    output: pathlib.Path,
-    *flags: str,
-) -> Iterator[Any]:
-  """Serves a world from a process, as people would."""
-  process = subprocess.Popen(
-      [
-          sys.executable, '-m', 'realab_suite.launchers.serve',
-          '--task=unlock_door.near', f'--output={output}', *flags,
-      ],
-      cwd=ROOT,
-      stdout=subprocess.PIPE,
-      stderr=subprocess.PIPE,
-      text=True,
-  )  # fmt: skip
-  try:
-    line = process.stdout.readline()
-    if ' at ' not in line:
-      raise RuntimeError(line + process.stderr.read())
-    yield Program(line.split(' at ')[1].strip(), process)
-  finally:
-    process.terminate()
-    process.communicate(timeout=patience.SECONDS)
+def _channel(address: str) -> grpc.Channel:
+  # Otherwise a second channel shares the first one's connection.
+  options = [('grpc.use_local_subchannel_pool', 1)]
+  return grpc.insecure_channel(address, options=options)
 
 
 class Client:
   """A client that sends any bytes, and returns the replies."""
 
   def __init__(self, address: str) -> None:
-    self.channel = grpc.insecure_channel(
-        address,
-        options=[
-            ('grpc.max_send_message_length', -1),
-            # Otherwise a second channel shares the first one's connection.
-            ('grpc.use_local_subchannel_pool', 1),
-        ],
-    )
+    self.channel = _channel(address)
     self.connection = rpc_connection.Connection(self.channel)
 
   def send(self, request: Any) -> Any:
@@ -199,13 +163,7 @@ class RawStream:
   """A stream of bytes, for requests that no honest client would send."""
 
   def __init__(self, address: str) -> None:
-    self.channel = grpc.insecure_channel(
-        address,
-        options=[
-            ('grpc.max_send_message_length', -1),
-            ('grpc.use_local_subchannel_pool', 1),
-        ],
-    )
+    self.channel = _channel(address)
     call = self.channel.stream_stream(METHOD)
     self._requests: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
     self._answers = call(
@@ -219,12 +177,9 @@ class RawStream:
   def tell(self, request: bytes) -> None:
     self._requests.put(request)
 
-  def cancel(self) -> None:
-    self._answers.cancel()
-
   def close(self) -> None:
     self._requests.put(None)
-    self.cancel()
+    self._answers.cancel()
     self.channel.close()
 
 
@@ -268,36 +223,18 @@ def join_eventually(
     address: Address of the server.
     meanwhile: Called after each refusal.
   """
-  return _eventually(lambda: Client(address), Client.join, meanwhile)
-
-
-def connect_eventually(
-    address: str, meanwhile: Callable[[], None] = lambda: None
-) -> RawStream:
-  """Returns a stream that has been admitted; see `join_eventually`."""
-  return _eventually(
-      lambda: RawStream(address), lambda stream: stream.ask(LEAVE), meanwhile
-  )
-
-
-def _eventually(
-    make: Callable[[], Any],
-    greet: Callable[[Any], Any],
-    meanwhile: Callable[[], None],
-) -> Any:
-  """Returns the first that is not refused, and closes those that are."""
-  admitted = []
+  joined = []
 
   def attempt() -> bool:
-    made = make()
+    client = Client(address)
     try:
-      greet(made)
+      client.join()
     except grpc.RpcError:
-      made.close()
+      client.close()
       meanwhile()
       return False
-    admitted.append(made)
+    joined.append(client)
     return True
 
   patience.until(attempt)
-  return admitted[0]
+  return joined[0]

@@ -130,16 +130,6 @@ def test_a_silent_client_loses_the_world():
     patience.until(lambda: serving.ends() == ['disconnect'] * 2)
 
 
-def test_a_client_that_sends_occasionally_stays():
-  with served.in_thread() as serving:
-    with served.Client(serving.address) as client:
-      client.join()
-      for i in range(5):
-        serving.clock.advance(0.9 * served.IDLE_SECONDS)
-        client.step(np.zeros(6) if i else None)
-      assert serving.ends() == []
-
-
 def test_one_thread_alone_runs_the_world():
   threads = set()
 
@@ -160,21 +150,6 @@ def test_one_thread_alone_runs_the_world():
         client.step(np.zeros(6))
     patience.until(lambda: len(serving.results) == 3)
     assert threads == {serving.thread.ident}
-
-
-def test_a_message_that_is_too_large_ends_the_connection_alone(serving):
-  before = len(serving.results)
-  stream = served.connect_eventually(serving.address)
-  stream.ask(served.JOIN)
-  stream.ask(served.STEP)
-  with pytest.raises(grpc.RpcError) as caught:
-    stream.ask(bytes(8 * 2**20))
-  assert caught.value.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
-  stream.close()
-  with served.join_eventually(serving.address) as following:
-    assert following.step().state == pb.RUNNING
-  patience.until(lambda: len(serving.results) == before + 2)
-  assert serving.ends()[before:] == ['disconnect'] * 2
 
 
 def test_after_the_last_episode_the_server_ends():
