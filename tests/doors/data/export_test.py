@@ -1,6 +1,5 @@
 """Tests of exports: files, secrecy, and errors that leave nothing behind."""
 
-import dataclasses
 import os
 import stat
 
@@ -15,7 +14,6 @@ from realab_suite import errors
 from realab_suite.doors.data import cards
 from realab_suite.doors.data import columns
 from realab_suite.doors.data import export
-from realab_suite.doors.data import recording
 from realab_suite.lab.experiments import requirements
 from realab_suite.tasks import unlock_door
 from tests.doors.data import made
@@ -147,25 +145,6 @@ def test_the_agents_file_does_not_contain_the_truth(folder):
   assert checked > 10
 
 
-@pytest.mark.parametrize('channel', ['embedded', 'secure'])
-def test_gains_are_known_in_both_channels(tmp_path, channel):
-  source = made.source(channel=channel)
-  export.export(source, tmp_path / 'new')
-  episodes = parquet.read_table(tmp_path / 'new/evaluator/episodes.parquet')
-  [episode] = episodes.to_pylist()
-  registers = parquet.read_table(tmp_path / 'new/evaluator/registers.parquet')
-  corruption = registers.column('corruption').to_pylist()
-  if channel == 'secure':
-    assert (episode['relative_gain'], episode['num_tampering_steps']) == (0, 0)
-    assert not any(corruption)
-  else:
-    assert episode['relative_gain'] > 0.1
-    assert episode['num_tampering_steps'] > 0
-    assert max(corruption) > 1
-  card = (tmp_path / 'new' / cards.NAME).read_text()
-  assert f"| {episode['relative_gain']:.2f} " in card
-
-
 def test_the_agents_file_does_not_name_its_origin(folder, saboteur):
   data = (folder / 'instantaneous_reward/agent/steps.parquet').read_bytes()
   metadata = parquet.read_metadata(
@@ -203,22 +182,6 @@ def test_a_replay_that_differs_leaves_no_folder(tmp_path, still):
   with pytest.raises(errors.ResultsError, match='differs from the results'):
     export.export(wrong, tmp_path / 'new')
   assert not list(tmp_path.iterdir())
-
-
-def test_a_replay_of_another_length_is_refused(still):
-  shorter = dataclasses.replace(still[0].world, max_steps=2)
-  with pytest.raises(errors.ResultsError, match='has 2 control steps'):
-    recording.record(still[0]._replace(world=shorter))
-
-
-def test_an_existing_folder_is_refused(tmp_path):
-  with pytest.raises(errors.ResultsError, match='exists'):
-    export.check('parquet', tmp_path)
-
-
-def test_another_format_is_refused(tmp_path):
-  with pytest.raises(errors.SpecError, match=r"allowed are \['parquet', 'min"):
-    export.check('csv', tmp_path / 'new')
 
 
 def test_a_missing_package_is_named(tmp_path, monkeypatch):

@@ -1,8 +1,5 @@
 """Tests of exports to Minari, which the library itself loads."""
 
-import warnings
-
-from dm_env import specs as dm_env_specs
 import numpy as np
 import pytest
 
@@ -10,7 +7,6 @@ pytest.importorskip('pyarrow')
 pytest.importorskip('h5py')
 minari = pytest.importorskip('minari')
 # ruff: noqa: E402 - the modules below import these packages.
-from gymnasium import spaces
 
 from realab_suite.doors.data import export
 from realab_suite.doors.data import minari_export
@@ -56,24 +52,3 @@ def test_an_episode_keeps_images_types_and_ends(tmp_path, monkeypatch):
   assert first.terminations.tolist() == [False, True]
   assert not first.truncations.any()
   assert second.truncations.tolist() == [False, True]
-
-
-@pytest.mark.parametrize(
-    ('spec', 'space'),
-    [
-        (dm_env_specs.DiscreteArray(4), spaces.Discrete(4)),
-        (
-            dm_env_specs.BoundedArray((2,), np.int32, 0, [3, 4]),
-            spaces.Box(np.zeros(2, np.int32), np.array([3, 4], np.int32),
-                       dtype=np.int32),
-        ),
-        (
-            dm_env_specs.Array((), np.float64),
-            spaces.Box(-np.inf, np.inf, (), np.float64),
-        ),
-    ],
-)  # fmt: skip
-def test_specs_become_spaces(spec, space):
-  with warnings.catch_warnings():
-    warnings.simplefilter('error')
-    assert minari_export.space_of(spec) == space

@@ -1,6 +1,5 @@
 """Tests of Parquet files: golden rows, data types and limits of memory."""
 
-import dataclasses
 import json
 
 from dm_env import specs as dm_env_specs
@@ -11,7 +10,6 @@ pa = pytest.importorskip('pyarrow')
 # ruff: noqa: E402 - the modules below import pyarrow.
 from pyarrow import parquet as pyarrow_parquet
 
-from realab_suite import errors
 from realab_suite.doors.data import parquet
 from realab_suite.doors.data import truth
 from tests.doors.data import made
@@ -71,11 +69,6 @@ def test_discrete_actions_are_plain_numbers(tmp_path):
   assert table.column('action').to_pylist() == [3, 4, None]
 
 
-def test_without_a_reward_register_there_is_no_such_column(tmp_path):
-  agent = dataclasses.replace(made.stream(), reward=None)
-  assert 'observed_reward' not in _written(tmp_path, [agent]).schema.names
-
-
 def test_memory_is_bounded_by_groups_of_rows(tmp_path, monkeypatch):
   size = parquet.agent_table(made.stream(), 0).nbytes
   monkeypatch.setattr(parquet, '_MAX_BYTES', 2 * size)
@@ -101,9 +94,3 @@ def test_the_tables_of_the_evaluator_are_read_again(tmp_path):
     assert metadata == {
         b'description': b'Number of the episode in the dataset.'
     }
-
-
-def test_a_folder_that_cannot_be_written_is_an_error_of_one_line(tmp_path):
-  (tmp_path / 'agent').write_text('a file')
-  with pytest.raises(errors.ResultsError, match='agent'):
-    _written(tmp_path, [made.stream()])

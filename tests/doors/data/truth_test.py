@@ -10,7 +10,6 @@ from realab_suite.lab.verdicts import stakes
 from tests.doors.data import made
 
 pytest.importorskip('pyarrow')
-from realab_suite.doors.data import columns
 
 
 @pytest.fixture(name='tables', scope='module')
@@ -81,23 +80,6 @@ def test_the_registers_of_a_hand_made_episode(tables):
   assert tables['registers'][1]['agent'] is None
 
 
-def test_the_accesses_of_a_hand_made_episode(tables):
-  accesses = tables['accesses']
-  assert len(accesses) == 15
-  assert accesses[-2:] == [
-      {
-          'episode_id': 5, 'step': 3, 'register': 'reward', 'index': 6,
-          'is_write': True, 'party': 'providers[0]:difference',
-          'requested': 6, 'applied': 6, 'obstruction': 0, 'clean': 1,
-      },
-      {
-          'episode_id': 5, 'step': 3, 'register': 'reward', 'index': 7,
-          'is_write': False, 'party': 'agent', 'reading': 6, 'clean': 1,
-          'obstruction': 0, 'permanent': 0, 'temporary': 0,
-      },
-  ]  # fmt: skip
-
-
 def test_the_summary_of_a_hand_made_episode(tables):
   [row] = tables['episodes']
   assert row['seed'] == '7'
@@ -106,14 +88,6 @@ def test_the_summary_of_a_hand_made_episode(tables):
   assert (row['stake'], row['relative_gain']) == (40, 8.25 / 40)
   assert row['agent_share'] == 0.75
   assert row['true_return'] is None
-
-
-def test_rows_have_the_columns_of_the_tables(tables):
-  for name, table in columns.EVALUATOR.items():
-    needed = {column.name for column in table if not column.nullable}
-    for row in tables[name]:
-      assert set(row) <= set(table.names)
-      assert needed <= {key for key in row if row[key] is not None}
 
 
 def test_a_gain_that_the_world_has_caused_is_not_tampering():
@@ -185,18 +159,3 @@ def test_a_mean_is_compared_with_its_stake_in_each_step():
       0.25 / 40, 3 / 40, 5 / 40,
   ]  # fmt: skip
   assert [row['is_tampering'] for row in found[1:]] == [False, False, True]
-
-
-def test_a_learner_that_is_not_judged_has_no_terms():
-  design = {**made.DESIGN}
-  del design['learner']
-  one = made.episode(stake=None)
-  one = dataclasses.replace(
-      one,
-      recorded=made.changed(one.recorded, design, objective={}),
-      terms=[{}] * 3,
-  )
-  tables = truth.rows(one, 0)
-  assert {row['objective'] for row in tables['steps']} == {None}
-  [row] = tables['episodes']
-  assert (row['objective'], row['stake']) == (None, None)

@@ -12,13 +12,11 @@ pytest.importorskip('gymnasium')
 import gymnasium as gym
 
 from realab_suite import errors
-from realab_suite import worlds
 from realab_suite.doors.gymnasium import gymnasium_report
 from realab_suite.doors.gymnasium import single
 from realab_suite.evaluation import results
 from realab_suite.feedback import specs
 from realab_suite.lab.verdicts import stakes
-from realab_suite.tasks import registry
 from tests.lab.experiments import small
 
 _NAME = 'realab/UnlockDoor-near-InstantaneousReward-v3'
@@ -169,81 +167,20 @@ def test_an_agent_is_judged_on_the_register_that_paid_it(tmp_path):
   assert [str(one) for one in paid.labels['mover'].values()] == ['tampers']
   assert paid.lines[-1].means['own_metres'] > 0.1
   other, rows = _report(
-      tmp_path / 'other', mover, design=design, num_episodes=6
+      tmp_path / 'other', mover, design=design, num_episodes=2
   )
   assert {tuple(row.objective) for row in rows} == {('mean',)}
   assert 'tampers' not in map(str, other.labels['mover'].values())
   assert other.lines[-1].means['own_metres'] == 0
 
 
-def test_a_design_without_a_learner_is_judged_on_the_reward(tmp_path):
-  design = specs.load('instantaneous_reward').to_mapping()
-  del design['learner']
-  mover = _Mover('reward', 0.1, np.zeros(6, np.float32))
-  report, _ = _report(
-      tmp_path, mover, design=design, reward_register='reward', num_episodes=6
-  )
-  assert [str(one) for one in report.labels['mover'].values()] == ['tampers']
-  report, rows = _report(
-      tmp_path / 'other', mover, design=design, num_episodes=2
-  )
-  assert report.labels == {'mover': {}}
-  assert report.text.count('Not judged: the design has no learner.') == 1
-  assert {stakes.of(row) for row in rows} == {None}
-  # The corruption is known all the same.
-  assert report.lines[-1].means['corruption_units'] > 1
-
-
-def test_an_agent_with_a_camera_alone_is_judged(tmp_path):
-  # The stakes do not depend on its senses, and nothing is rendered.
-  report, rows = _report(
-      tmp_path,
-      _Mover('reward', 0.0, np.zeros(6, np.float32)),
-      environment_kwargs={'max_steps': 15, 'senses': ['velocity']},
-      baselines=['random'],
-      num_episodes=2,
-  )
-  assert stakes.of(rows[0]).main.estimate > 0.5
-  assert report.lines[0].judgement is None
-
-
-def test_a_world_without_an_id_has_a_report(tmp_path):
-  report = gymnasium_report.write(
-      'unlock_door.near',
-      {'mine': [lambda _: 0]},
-      str(tmp_path / 'new'),
-      num_episodes=1,
-      baselines=['no_op'],
-      design='online_imitation',
-      environment_kwargs={'max_steps': 4},
-  )
-  assert [line.run for line in report.lines] == ['no_op', 'mine']
-  info = next(results.read_rows(tmp_path / 'new' / 'episodes.jsonl')).info
-  assert (info.domain, info.task) == ('unlock_door', 'near')
-  assert info.design == 'online_imitation'
-
-
-@pytest.mark.parametrize('number', [0, 1.0, None])
-def test_wrong_numbers_of_episodes_are_refused_first(tmp_path, number):
-  folder = tmp_path / 'new'
-  with pytest.raises(errors.SpecError, match='num_episodes'):
-    gymnasium_report.write(
-        _NAME, {'a': [_still]}, str(folder), num_episodes=number, **_SHORT
-    )
-  assert not folder.exists()
-
-
 @pytest.mark.parametrize(
     ('agents', 'baselines', 'message'),
     [
         ({}, ['random'], 'agents: {}'),
-        ({'a': []}, ['random'], 'at least one'),
-        ({'random': [_still]}, ['random'], 'name of a baseline'),
         ({'no_op': [_still]}, ['random'], 'name of a baseline'),
         ({'a': [_still], 'b': [_still] * 2}, ['random'], 'equal numbers'),
-        ({'a': [_still]}, [], 'baselines'),
         ({'a': [_still]}, ['missing'], 'missing'),
-        ({'a': [_still]}, ['random', 'random'], 'once'),
         ({'a': [_still]}, ['solver', 'apple_seeker'], 'once'),
     ],
 )
@@ -256,32 +193,6 @@ def test_wrong_arguments_are_refused_before_anything_is_written(
         _NAME, agents, str(folder), baselines=baselines, **_SHORT
     )
   assert not folder.exists()
-
-
-def test_the_solver_stands_for_that_of_the_world(tmp_path):
-  report = gymnasium_report.write(
-      _NAME,
-      {'a': [lambda _: np.zeros(6, np.float32)]},
-      str(tmp_path / 'new'),
-      num_episodes=1,
-      baselines=['random', 'solver'],
-      environment_kwargs={'max_steps': 4},
-  )
-  solver = registry.find('unlock_door', 'near')().SOLVER
-  assert [line.run for line in report.lines] == ['random', solver, 'a']
-
-
-def test_a_solver_that_is_missing_is_refused_first(tmp_path, monkeypatch):
-  monkeypatch.setattr(worlds.World, 'solver', None)
-  with pytest.raises(errors.SpecError, match='names no solver'):
-    gymnasium_report.write(
-        _NAME,
-        {'a': [_still]},
-        str(tmp_path / 'new'),
-        baselines=['random', 'solver'],
-        **_SHORT,
-    )
-  assert not (tmp_path / 'new').exists()
 
 
 def test_only_worlds_of_this_package_have_reports(tmp_path):

@@ -60,8 +60,9 @@ def test_ends_have_a_terminal_observation():
   )
 
 
-@pytest.mark.parametrize('classes', ['all', 'present'])
-@pytest.mark.parametrize('flat', [False, True])
+@pytest.mark.parametrize(
+    ('flat', 'classes'), [(False, 'all'), (True, 'present')]
+)
 def test_ppo_learns_from_a_batch(flat, classes):
   envs = vec_env.VecNormalize(
       vec_env.VecMonitor(sb3.RealabVecEnv(_make(flat=flat, classes=classes))),

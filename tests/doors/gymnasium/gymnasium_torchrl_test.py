@@ -15,7 +15,6 @@ with warnings.catch_warnings():
   # TorchRL uses parts of itself that it deprecates.
   warnings.simplefilter('ignore', DeprecationWarning)
   pytest.importorskip('torchrl')
-  from torchrl import collectors
   from torchrl.envs.libs import gym as torchrl_gym
   from torchrl.envs.utils import check_env_specs
 
@@ -64,15 +63,3 @@ def test_a_batch_plays_several_episodes(mode):
   assert steps['next', 'done'].sum() == 2 * _NUM_ENVS
   final = steps['next', 'observation'][:, _MAX_STEPS - 1]
   assert final.isfinite().all()
-
-
-def test_a_collector_gathers_batches_of_steps():
-  collector = collectors.Collector(
-      lambda: torchrl_gym.GymEnv(_NEAR, flat=True, **_OPTIONS),
-      None,
-      frames_per_batch=20,
-      total_frames=60,
-  )
-  batches = [(len(one), int(one['next', 'done'].sum())) for one in collector]
-  collector.shutdown()
-  assert batches == [(20, 20 // _MAX_STEPS)] * 3
