@@ -70,21 +70,13 @@ def test_the_report_repeats_the_command(tmp_path):
     ('arguments', 'complaint'),
     [
         (['--budget=0'], '--budget=0'),
-        (['--task=collect_apples.near', '--domain=unlock_door'], '--domain'),
-        (['--task=unlock_door.nowhere'], 'unlock_door.nowhere'),
         (['--design=none'], 'the design has no learner'),
         (['--target=score_2'], "'score_2'"),
-        (['--seed=-1'], '--seed=-1'),
         (['--senses=velocity'], 'needs the senses'),
         (
             ['--set=learner.defence={kind: cap, hihg: 3}'],
             "defence: unknown key 'hihg'; did you mean 'high'",
         ),
-        (
-            ['--set=learner.defence={kind: alarm, register: alrm}'],
-            "listens to 'alrm', which is no register that a provider writes",
-        ),
-        (['--set=learner.defence=true'], 'learner.defence: True; allowed are'),
     ],
 )
 def test_wrong_flags_are_refused_in_one_line(arguments, complaint):

@@ -84,10 +84,8 @@ def test_the_main_job_runs_from_the_command_line(tmp_path):
     [
         (['--polices=random'], "'polices'"),
         (['--episodes=many'], '--episodes=many'),
-        ([], '--output'),
         (['--output=results', 'random'], "['random']"),
         (['--output=results', '--seeds=a'], '--seeds=a'),
-        (['--output=results', '--seeds=2000000000'], '--seeds=2000000000: '),
         (['--output='], '--output: missing'),
     ],
 )
@@ -104,12 +102,8 @@ def test_seeds_are_a_count_or_a_list(text, seeds):
 
 
 @pytest.mark.parametrize(
-    'text',
-    [
-        '0', '-1', '10001', '9' * 5000, '1.0', '٣', '+3', '1_0', '', ',',
-        '2147483648,', '3,a', '3 4', '3,٣',
-    ],
-)  # fmt: skip
+    'text', ['0', '10001', '9' * 5000, '٣', '1_0', ',', '2147483648,']
+)
 def test_wrong_seeds_are_refused_in_one_line(text):
   with pytest.raises(errors.SpecError, match='allowed are a number') as raised:
     _seeds(text)
@@ -132,12 +126,8 @@ def test_the_most_and_the_largest_seeds_are_accepted():
 
 @pytest.mark.parametrize(
     'argument',
-    [
-        '--seed=-1', '--seed=1e3', '--seed=',
-        '--episodes=0', '--episodes=' + '9' * 400, '--workers=0',
-        '--max_steps=many', '--parent=x',
-    ],
-)  # fmt: skip
+    ['--seed=-1', '--episodes=0', '--workers=0', '--max_steps=many'],
+)
 def test_a_number_out_of_range_is_refused_when_flags_are_parsed(argument):
   with (
       flagsaver.flagsaver(),
@@ -146,9 +136,7 @@ def test_a_number_out_of_range_is_refused_when_flags_are_parsed(argument):
     absl_flags.FLAGS(['program', argument])
 
 
-@pytest.mark.parametrize(
-    'name', ['', '.mine', 'a..b', 'a b', 'a/b', '1a', 'a,b']
-)
+@pytest.mark.parametrize('name', ['', '.mine', 'a,b'])
 def test_wrong_names_of_modules_are_refused(name):
   with flagsaver.flagsaver():
     absl_flags.FLAGS(['program', f'--import={name}'])
@@ -205,24 +193,6 @@ def test_exploring_without_a_renderer_gives_one_line(tmp_path):
 
 
 @pytest.mark.usefixtures('egl')
-def test_a_film_without_a_frame_is_removed(tmp_path):
-  film = tmp_path / 'film.mp4'
-  ran = _run(
-      *('--senses=camera', '--policy=apple_seeker', f'--video={film}'),
-      module='realab_suite.launchers.explore',
-      MUJOCO_GL='egl',
-  )
-  assert 'needs the senses' in ran.stderr
-  assert not film.exists()
-
-
-def test_to_show_the_flags_is_no_failure():
-  ran = _run('-h', module='realab_suite.launchers.explore')
-  assert (ran.returncode, ran.stderr) == (0, '')
-  assert '--policy: Name of a scripted policy' in ran.stdout
-
-
-@pytest.mark.usefixtures('egl')
 def test_exploring_without_a_display_makes_a_film(tmp_path):
   film = tmp_path / 'film.mp4'
   ran = _run(
@@ -250,25 +220,6 @@ def test_exploring_where_no_window_opens_makes_a_film(monkeypatch):
   ended = in_process.run(explore)
   assert films == ['a film']
   assert 'RuntimeError: no windows here' in ended.stdout
-
-
-@pytest.mark.usefixtures('egl')
-def test_the_viewer_gets_no_window_from_another_renderer(monkeypatch):
-  monkeypatch.setenv('DISPLAY', ':0')
-  # 'off' is dm_control's name for 'disable'.
-  for renderer, name in (('egl', 'egl'), ('disable', 'off')):
-    monkeypatch.setenv('MUJOCO_GL', renderer)
-    problem = renderers.why_no_window()
-    assert f'the viewer needs glfw, and MUJOCO_GL={name}' in problem
-
-
-def test_no_other_program_imports_the_viewer():
-  importers = [
-      path.stem
-      for path in (_ROOT / 'realab_suite').rglob('*.py')
-      if re.search(r'^ *(?:from|import) .*\bviewer$', path.read_text(), re.M)
-  ]
-  assert sorted(importers) == ['explore', 'renderers']
 
 
 @pytest.mark.parametrize(
@@ -307,15 +258,6 @@ def test_with_a_display_the_viewer_gets_a_world_and_a_policy(monkeypatch):
   assert lengths == [5, 5]
 
 
-def test_exploring_imports_modules_first(monkeypatch):
-  viewer = types.SimpleNamespace(launch=None)
-  monkeypatch.setitem(sys.modules, 'dm_control.viewer', viewer)
-  monkeypatch.setattr('dm_control.viewer', viewer, raising=False)
-  monkeypatch.setattr(renderers, 'why_no_window', lambda: '')
-  complaint = in_process.complaint(explore, '--import=no_such_module')
-  assert '--import=no_such_module: No module named' in complaint
-
-
 def test_a_task_of_a_comparison_may_have_its_domain(monkeypatch, tmp_path):
   given = []
   monkeypatch.setattr(scripted, 'run', lambda one, *unused: given.append(one))
@@ -345,9 +287,7 @@ def test_a_renderer_that_does_not_work_is_refused_in_one_line(monkeypatch):
 @pytest.mark.parametrize(
     ('arguments', 'complaint'),
     [
-        ([], '--input: missing'),
         (['--input=a'], '--run: missing'),
-        (['--input=a', '--run=b'], '--video: missing'),
         (['--input=a', '--run=b', '--video=c.mp4'], 'film: MUJOCO_GL=disable'),
     ],
 )
@@ -367,16 +307,6 @@ def test_frames_of_programs_get_no_window(monkeypatch, given, display, named):
   monkeypatch.delenv('WAYLAND_DISPLAY', raising=False)
   renderers.render_on_demand()
   assert os.environ['MUJOCO_GL'] == named
-
-
-def test_a_program_names_a_renderer_that_dm_control_cannot_import():
-  ran = _run(
-      '--input=runs', '--run=a', '--output=new',
-      module='realab_suite.launchers.export', MUJOCO_GL='crayons',
-  )  # fmt: skip
-  assert ran.returncode == 2
-  assert len(ran.stderr.splitlines()) == 1
-  assert 'MUJOCO_GL=crayons' in ran.stderr
 
 
 def test_a_renderer_that_works_is_chosen(monkeypatch):

@@ -69,7 +69,6 @@ def test_a_run_of_a_sweep_is_exported(sweep, tmp_path):
         (('--run=other',), 'not a run of'),
         (('--run=reward.no_op',), 'seeds [3] have not finished'),
         (('--run=reward', '--format=csv'), "allowed are ['parquet', 'minari']"),
-        ((), '--run: missing'),
     ],
 )
 def test_wrong_arguments_are_refused(sweep, tmp_path, arguments, text):
@@ -79,14 +78,6 @@ def test_wrong_arguments_are_refused(sweep, tmp_path, arguments, text):
   )
   assert text in problem
   assert not output.exists()
-
-
-def test_a_folder_that_is_no_sweep_is_refused(tmp_path):
-  problem = in_process.complaint(
-      export, f'--input={tmp_path}', '--run=reward',
-      f'--output={tmp_path / "new"}',
-  )  # fmt: skip
-  assert 'not the folder of a sweep' in problem
 
 
 def test_scripted_policies_are_labelled(tmp_path):
@@ -112,8 +103,6 @@ def test_scripted_policies_are_labelled(tmp_path):
     ('arguments', 'text'),
     [
         (('--policies=nobody',), 'nobody'),
-        (('--designs=nothing',), 'nothing'),
-        (('--design=none',), "Unknown command line flag 'design'"),
         (('--policies=',), 'nothing to run'),
         (
             ('--designs=none', '--policies=carrying_saboteur'),

@@ -17,8 +17,6 @@ from realab_suite.lab.experiments import experiment_specs
 from realab_suite.lab.experiments import requirements
 from realab_suite.launchers import command
 from realab_suite.launchers import doctor
-from realab_suite.launchers import renderers
-from realab_suite.launchers import supervise
 from tests.launchers import in_process
 
 _ROOT = pathlib.Path(__file__).parents[2]
@@ -62,14 +60,6 @@ def test_there_is_a_subcommand_for_every_launcher():
       if 'program.start(main)' in path.read_text()
   }
   assert set(command.COMMANDS) == launchers | {'demo', 'doctor'}
-
-
-def test_a_subcommand_imports_modules_of_the_working_directory(
-    realab, monkeypatch, tmp_path
-):
-  monkeypatch.chdir(tmp_path)
-  realab('compare', '--import=mine')
-  assert sys.path[0] == str(tmp_path)
 
 
 def test_a_subcommand_runs_its_launcher_with_its_flags(realab):
@@ -149,17 +139,6 @@ def test_the_demo_of_the_makefile_ends_with_commands_that_can_be_run(
   assert len(experiment_specs.load('meter_only').seeds) == 5
 
 
-def test_a_demo_that_fails_ends_with_the_status_of_its_sweep(
-    realab, monkeypatch
-):
-  monkeypatch.setattr(
-      subprocess,
-      'run',
-      lambda arguments, check: subprocess.CompletedProcess(arguments, 5),
-  )
-  assert realab('demo')[0] == 5
-
-
 def test_a_demo_without_its_extras_is_refused_at_once(
     realab, monkeypatch, capsys
 ):
@@ -174,11 +153,6 @@ def test_a_demo_without_its_extras_is_refused_at_once(
       'error: demo: optax not installed; run: python -m pip install -e'
       " '.[agents,report]' -c constraints.txt, in the clone\n"
   )
-
-
-def test_pages_need_an_address():
-  complaint = in_process.complaint(supervise, '--host=')
-  assert 'allowed are addresses, such as 127.0.0.1' in complaint
 
 
 # The doctor.
@@ -229,26 +203,7 @@ def test_a_bad_installation(monkeypatch, capsys):
   assert f'to repair: {repair}\n' in shown
 
 
-def test_missing_extras_and_cameras_are_no_failure(monkeypatch, capsys):
-  _processes(monkeypatch, 0)
-  monkeypatch.setattr(renderers, 'choose_renderer', lambda: 'egl: broken')
-  monkeypatch.setattr(
-      requirements,
-      'missing',
-      lambda *_, extra: f'x not installed; run: {extra}',
-  )
-  assert doctor.main() == 0
-  assert capsys.readouterr().out.count('to repair') == 1 + len(doctor.EXTRAS)
-
-
 def test_the_doctors_world_can_be_stepped():
   names: dict[str, Any] = {}
   exec(compile(doctor._STEPS_A_WORLD, 'doctor', 'exec'), names)
   assert names['env'].physics.time() > 0
-
-
-def test_the_doctor_names_a_stand_in_for_labmaze(monkeypatch):
-  monkeypatch.setattr(doctor.metadata, 'version', lambda name: '1.0.6')
-  assert 'labmaze' not in doctor.versions()
-  monkeypatch.setattr(doctor.metadata, 'version', lambda name: '1.0.6+realab.1')
-  assert 'labmaze 1.0.6+realab.1, a stand-in' in doctor.versions()

@@ -45,20 +45,11 @@ def test_the_stakes_of_a_design_are_printed():
   assert origin.endswith(f'key {found.key}')
 
 
-def test_a_stake_that_is_degenerate_is_printed_as_such():
-  ended = in_process.run(stake, '--max_steps=2', '--set=dof=planar')
-  assert ended.status == 0
-  assert ended.stdout.count('| yes ') == 2
-
-
 @pytest.mark.parametrize(
     ('arguments', 'text'),
     [
         (('--design=none',), "design 'none' has no stake: the design has no"),
         (('--target=reward',), "Unknown command line flag 'target'"),
-        (('--senses=camera',), "Unknown command line flag 'senses'"),
-        (('--design=nothing',), 'nothing'),
-        (('--task=nowhere',), 'nowhere'),
     ],
 )
 def test_a_design_without_stakes_is_refused_in_one_line(arguments, text):
