@@ -38,9 +38,7 @@ def test_a_file_is_read_and_named_in_errors(tmp_path):
   assert message.startswith(f'{path}:2: ')
 
 
-@pytest.mark.parametrize(
-    'path', ['absent.yaml', 'a\0b', '', 'x' * 5000, '\udcff']
-)
+@pytest.mark.parametrize('path', ['absent.yaml', 'a\0b', 'x' * 5000])
 def test_a_path_that_does_not_or_cannot_exist_is_refused(path):
   with pytest.raises(errors.SpecError, match='no such file'):
     loading.read_mapping(path)
@@ -52,19 +50,6 @@ def test_a_directory_and_a_named_pipe_are_refused(tmp_path):
   for path in (tmp_path, tmp_path / 'pipe'):
     with pytest.raises(errors.SpecError, match='not a file'):
       loading.read_mapping(path)
-
-
-def test_an_unreadable_file_is_refused(tmp_path, monkeypatch):
-  path = tmp_path / 'design.yaml'
-  path.write_text('a: 1', encoding='utf-8')
-
-  # A superuser can read a file without permissions, so chmod is no use.
-  def refuse(path: str, mode: str) -> None:
-    raise PermissionError(13, 'Permission denied', path)
-
-  monkeypatch.setattr('builtins.open', refuse)
-  with pytest.raises(errors.SpecError, match='cannot be read: Permission'):
-    loading.read_mapping(path)
 
 
 def test_a_huge_file_is_refused_by_its_size(tmp_path):
@@ -112,19 +97,12 @@ def test_values_of_a_mapping_become_plain():
     ('source', 'fragment'),
     [
         ({'a': [{'b': float('nan')}]}, 'a[0].b: must be finite, got nan'),
-        ({'a': -np.inf}, 'a: must be finite, got -inf'),
-        ({'a': 2**53 + 1}, 'a: integer 9007199254740993 is out of range'),
         ({'a': 10**5000}, 'a: integer <int> is out of range'),
         ({'a': {1: 2}}, 'a: keys must be strings, got 1'),
         ({'a\0': 2}, 'character U+0000 is not allowed'),
-        ({'a': 'x\u202e'}, 'a: character U+202E is not allowed'),
         ({'a': '\ud800'}, 'a: character U+D800 is not allowed'),
-        ({'a': [0] * 1001}, 'a: more than 1000 entries'),
         (dict.fromkeys(map(str, range(1001))), 'more than 1000 entries'),
         ({'a': {1, 2}}, 'a: expected a mapping, list, string, number'),
-        ({'a': b'x'}, 'a: expected a mapping, list, string, number, boolean'),
-        ({'a': 1j}, 'got 1j'),
-        ({'a': np.zeros(2)}, 'got array([0., 0.])'),
         ({'a b': {'c': np.int64(1)}}, "['a b'].c: expected a mapping"),
         (_nested(33), 'nested deeper than 32'),
     ],
@@ -134,10 +112,6 @@ def test_a_mapping_is_checked_like_a_file(source, fragment):
   assert message.startswith('<mapping>: ')
   assert fragment in message
   assert len(message) < 400
-
-
-def test_a_mapping_may_be_as_deep_as_a_file():
-  assert loading.read_mapping(_nested(32)) == _nested(32)
 
 
 def test_a_mapping_without_end_is_refused():
@@ -160,13 +134,10 @@ def _design() -> dict[str, Any]:
 
 @pytest.mark.parametrize(('override', 'keys', 'value'), [
     ('registers.reward.scale=0.2', ('registers', 'reward', 'scale'), 0.2),
-    ('registers.reward.scale=1e3', ('registers', 'reward', 'scale'), 1e3),
-    ('providers.1.kind=other', ('providers', 1, 'kind'), 'other'),
     ('registers.reward.range.0=-1', ('registers', 'reward', 'range', 0), -1),
     ('providers.0={a: [1, 2]}', ('providers', 0), {'a': [1, 2]}),
     ('new.deep.er=true', ('new', 'deep', 'er'), True),
     ('registers.goal.label="a=b"', ('registers', 'goal', 'label'), 'a=b'),
-    ('nothing=a=b', ('nothing',), 'a=b'),
     ('registers=null', ('registers',), None),
     ("nothing=''", ('nothing',), ''),
     ('nothing= 5 # five', ('nothing',), 5)
@@ -190,30 +161,17 @@ def test_overrides_change_nothing_else_and_leave_their_input_alone():
   assert data == _design()
 
 
-def test_the_last_override_wins():
-  result = loading.apply_overrides({}, ['a.b=1', 'a.b=2', 'a.c=3'])
-  assert result == {'a': {'b': 2, 'c': 3}}
-
-
 @pytest.mark.parametrize(('override', 'fragment'), [
     ('registers', 'expected key=value'),
-    ('=1', 'empty key'),
-    ('a..b=1', 'empty key'),
     ('a. .b=1', 'empty key'),
     ('registers.reward.scale.x=1',
         "'x' is not in 'registers.reward.scale', which is 1.0; allowed are"),
-    ('nothing.x=1', "'x' is not in 'nothing', which is None; allowed"),
-    ('providers.2.kind=x',
-        "'2' is not in 'providers'"),
-    ('providers.-1.kind=x', "'-1' is not in 'providers'"),
+    ('providers.2.kind=x', "'2' is not in 'providers'"),
     ('providers.kind=x', "'kind' is not in 'providers'"),
     ('providers.01.kind=x', "'01' is not in 'providers'"),
     ('providers.' + '1' * 5000 + '=x', "is not in 'providers'"),
     ('nothing=', 'expected one value'),
-    ('nothing=1\n---\n2', 'expected one value'),
     ('nothing=yes', "'yes' is ambiguous"),
-    ('nothing=[', 'did not find expected node content'),
-    ('noth\ting=1', 'tab is not allowed'),
     ('\u202e=1', 'character U+202E is not allowed'),
     ('a.' * 5000 + 'a=1', 'nested deeper than 32'),
     ('a.b=' + '[' * 31 + ']' * 31, 'nested deeper than 32')
@@ -223,9 +181,3 @@ def test_a_wrong_override_is_named(override, fragment):
   assert message.startswith('override ')
   assert fragment in message
   assert len(message) < 500
-
-
-def test_an_override_that_adds_one_entry_too_many_is_refused():
-  data = dict.fromkeys(map(str, range(1000)))
-  message = refusals.refusal(loading.apply_overrides, data, ['more=1'])
-  assert message == "override 'more=1': more than 1000 entries"

@@ -90,15 +90,12 @@ _PLACES: dict[str, dict[str, Any]] = {
         for option in _OPTIONS},
     **{f'file of {policy}': _design(_demonstrated(policy, file=_PATH))
         for policy in ('test_inheriting', 'test_function')},
-    **{f'{depth} policies deep': _design(_wrapped(depth, 'network_demonstrator',
-        weights=_PATH)) for depth in (0, 1, 24)},
+    '24 policies deep': _design(_wrapped(24, 'network_demonstrator',
+        weights=_PATH)),
     'weights of a value function': _design({**_ADVICE,
         'value_function': 'network_values', 'options': {'weights': _PATH}}),
-    'policy of a value function': _design(_approved('network_demonstrator',
-        weights=_PATH)),
     'inner policy of a value function': _design(_approved('test_wrapping',
         inner='test_reader', inner_options={'file': _PATH})),
-    'provider': _design({**_READING, 'file': _PATH}),
     'model of a provider': _design({**_READING, 'more': {'file': _PATH}}),
     'policy of a provider': _design({**_READING, 'teacher': 'test_reader',
         'teacher_options': {'file': _PATH}}),
@@ -153,27 +150,12 @@ def test_a_path_is_confined_where_a_file_names_it(
   assert specs.load(loaded.to_mapping()).digest() == loaded.digest()
 
 
-def test_an_absolute_path_within_the_directory_is_accepted():
-  pathlib.Path('sub', 'mine.txt').touch()
-  path = os.path.abspath('sub/mine.txt')
-  design = specs.load(_file(_design(_demonstrated('test_reader', file=path))))
-  assert design.to_mapping()['providers'][0]['options']['file'] == path
-
-
-@pytest.mark.parametrize(
-    'path', ['', '.', 'x', 'a' * 5000, 'a/' * 300, '$HOME/x']
-)
+@pytest.mark.parametrize('path', ['.', 'a' * 5000])
 def test_a_path_that_is_no_file_is_refused(path: str):
   design = _design(_wrapped(1, 'network_demonstrator', weights=path))
   text = _refusal(specs.load, _file(design))
   assert text.startswith('given.yaml: providers[0]: weights ')
   assert 'are neither a file nor one of' in text
-
-
-def test_a_path_with_nul_is_refused():
-  design = _design(_wrapped(1, 'network_demonstrator', weights='a\0b'))
-  text = _refusal(specs.load, _file(design))
-  assert 'inner_options.weights: character U+0000 is not allowed' in text
 
 
 def test_options_that_are_not_paths_may_contain_any_text():
@@ -194,15 +176,7 @@ class _Folder(pydantic.BaseModel):
   path: pathlib.Path
 
 
-@pytest.mark.parametrize(
-    'declared',
-    [
-        pathlib.Path,
-        str | os.PathLike[str],
-        pathlib.PurePath | None,
-        list[_Folder] | None,
-    ],
-)
+@pytest.mark.parametrize('declared', [pathlib.Path, list[_Folder] | None])
 def test_paths_of_types_that_are_not_checked_are_refused(declared: Any):
   def make(file: declared = 'x') -> policies.Policy:
     raise AssertionError(file)
@@ -249,27 +223,6 @@ def test_a_path_of_the_file_stays_confined_beside_overrides(
   for override in ('dof=planar', 'providers.0.options.files.0=given.yaml'):
     text = _refusal(specs.load, _file(design), (override,))
     assert text.startswith('given.yaml: providers[0].options.files[1]: ')
-
-
-def test_a_path_may_be_in_the_file_if_an_override_names_it(
-    outside: pathlib.Path,
-):
-  path = str(outside / 'secret.npz')
-  design = _file(_design(_demonstrated('test_reader', files=['', path])))
-  override = f'providers.0.options.file={path}'
-  specs.load(design, (override,))
-  text = _refusal(specs.load, design, (override,), is_confined=True)
-  assert 'is outside the working directory' in text
-
-
-def test_a_text_that_an_override_makes_a_path_is_confined(
-    outside: pathlib.Path,
-):
-  path = str(outside / 'secret.npz')
-  design = _design(_demonstrated('test_wrapping', inner_options={'file': path}))
-  override = 'providers.0.options.inner=test_reader'
-  text = _refusal(specs.load, _file(design), (override,))
-  assert 'providers[0].options.inner_options' in text
 
 
 _TRUSTING = ('learner', 'defence', 'trusted', 'options', 'weights')

@@ -99,31 +99,18 @@ def _typed() -> Iterator[None]:
     ('apple_seeker', {'half_widht': 3},
         ": unknown key 'half_widht'; did you mean 'half_width'? (allowed:"
         ' half_width)'),
-    ('apple_seeker', {'self': 3}, ": unknown key 'self' (allowed: half_w"),
-    ('apple_seeker', {'half_width': None},
-        '.half_width: must be a valid number, got null'),
     ('apple_seeker', {'half_width': -1},
         '.half_width: must be greater than 0, got -1'),
-    ('network_demonstrator', {'weights': ['demonstrator_v1']},
-        ".weights: must be a valid string, got ['demonstrator_v1']"),
-    ('pushing_saboteur', {'target': [1, 2, 3]},
-        '.target: must have at most 2 items'),
     ('pushing_saboteur', {'target': [1]},
         '.target: must have at least 2 items, got [1]'),
     ('test_typed', {'flag': False}, '.needed: required key is missing'),
     ('test_typed', {'needed': 1, 'mapping': {'a': 'x'}},
         ".mapping.a: must be a valid integer, got 'x'"),
-    ('test_typed', {'needed': 1, 'odd': ['x', 3]},
-        '.odd[1]: must be a valid string, got 3'),
     ('test_unreadable', {'thing': 1},
         ": the options of 'test_unreadable' cannot be read from its"
         " signature: name 'Nothing' is not defined"),
     ('test_wrapping', {'inner': 'no_opp'},
         ".inner: policy 'no_opp' is unknown; did you mean 'no_op'?"),
-    ('test_wrapping', {'inner_options': [1]},
-        '.inner_options: must be a mapping, got [1]'),
-    ('test_inheriting', {'mine': 'x'},
-        ".mine: must be a valid integer, got 'x'"),
     ('test_inheriting', {'no': 1}, ": unknown key 'no' (allowed: mine, fi"),
     ('test_function', {'lable': 'x'}, "; did you mean 'label'? (allowed: ")
 ])  # fmt: skip
@@ -150,7 +137,6 @@ def test_wrong_options_of_inner_policies_are_refused(depth: int):
 @pytest.mark.parametrize(
     ('policy', 'options'),
     [
-        ('apple_seeker', {'half_width': 3}),
         ('pushing_saboteur', {'target': [1, -2.5], 'direction': [0, 1]}),
         ('test_typed', {'needed': 3, 'pair': [1, 2], 'sequence': [1, 2.5]}),
         ('test_typed', {'needed': 3, 'mapping': {'a': 1}, 'untyped': {'b': 0}}),

@@ -22,17 +22,12 @@ _WRONG = {
         ' got -1',
     # Not in the file.
     'registers.reward.mass=-1': 'registers.reward.mass: must be greater than',
-    'registers.reward.options.speed=1':
-        "registers.reward.options: unknown key 'speed' (allowed: none)",
     'metres=[]': "unknown key 'metres'; did you mean 'meters'?",
     'learner.reward=reward': 'learner.kind: required key is missing',
     'schedule.meter_substep=3':
         'schedule.provider_substep: required key is missing',
-    'providers.0.query_delay=2': 'providers[0].query_delay: must be 0 or 1',
     'providers.0.options.options.speed=1':
         "providers[0].options.options: unknown key 'speed'",
-    'providers.0.value_function=oracle':
-        "providers[0].value_function: value function 'oracle' is unknown"
 }  # fmt: skip
 _RIGHT = (
     'dof=planar',
@@ -48,14 +43,7 @@ _CROSS = {
     'registers.query.role=meter':
         "providers[0]: value_advice reads the query from 'query', whose role is"
         " 'meter'",
-    'registers.query.range=[0, 5]':
-        'registers.query.range: [0.0, 5.0] excludes actions of dmlab_like v1',
-    'registers.reward.role=meter':
-        "providers[0].writes: register 'reward' has role 'meter'",
     'registers={}': "providers[0].reads: register 'query' is not declared",
-    'action_set=null': 'providers[0]: value_advice uses action set',
-    'meters=[{measures: score, writes: query}]':
-        "meters[0].writes: register 'query' has role 'query'",
     'learner={kind: value_advice, advice: extra}':
         "learner.advice: an agent may not read meter register 'extra'"
 }  # fmt: skip
@@ -121,12 +109,6 @@ def test_an_override_replaces_a_wrong_value_of_the_file():
   assert text.startswith("override 'dof=loose': ")
 
 
-def test_the_first_of_several_wrong_overrides_is_named():
-  overrides = ('name=e', 'dof=fixed', 'channel=loose')
-  text = _refusal(_DESIGN, *overrides)
-  assert text.startswith("override 'dof=fixed': dof: must be 'free' or")
-
-
 def test_few_of_many_overrides_are_judged_to_find_the_wrong_one(monkeypatch):
   applied = []
   apply = loading.apply_overrides
@@ -146,14 +128,6 @@ def test_few_of_many_overrides_are_judged_to_find_the_wrong_one(monkeypatch):
   assert len(applied) <= 6 * 10
 
 
-def test_a_long_list_of_problems_is_cut():
-  reward = {**_DESIGN['registers']['reward'], 'mass': -1}
-  registers = {f'r{i}': reward for i in range(12)}
-  text = _refusal(_changed(registers=registers))
-  assert text.startswith('design: registers.r0.mass: ')
-  assert text.endswith('; and 2 more')
-
-
 def test_of_two_overrides_that_contradict_each_other_the_later_is_named():
   first, second = 'registers.reward.range=[0, 1]', 'registers.reward.initial=9'
   for override in (first, second):
@@ -163,16 +137,7 @@ def test_of_two_overrides_that_contradict_each_other_the_later_is_named():
   assert _refusal(_DESIGN, second, first) == f'override {first!r}: {problem}'
 
 
-@pytest.mark.parametrize(
-    'override',
-    [
-        'registers.reward.kind={}',
-        '{}=1',
-        'registers.{}=1',
-        'providers.0.reads=[{}]',
-        'providers.0.options.{}=1',
-    ],
-)
+@pytest.mark.parametrize('override', ['registers.reward.kind={}', '{}=1'])
 def test_a_long_override_is_cut_in_the_message(override: str):
   override = override.format('k' * 100_000)
   text = _refusal(_DESIGN, override)
@@ -180,9 +145,7 @@ def test_a_long_override_is_cut_in_the_message(override: str):
   assert len(text) < 600
 
 
-@pytest.mark.parametrize(
-    'overrides', ['dof=free', None, 3, {}, {'a': 1}, (None,), (b'a=1',)]
-)
+@pytest.mark.parametrize('overrides', ['dof=free', None, {'a': 1}, (None,)])
 def test_overrides_that_are_no_list_of_texts_are_refused(overrides: Any):
   assert 'override' in refusals.refusal(specs.load, _DESIGN, overrides)
 
