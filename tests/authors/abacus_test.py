@@ -1,11 +1,10 @@
-"""A register of three blocks and two ports, through every part of the package.
+"""A register of three blocks and two ports, in the rest of the package.
 
-The register is that of an author, `abacus.py`. Its ports are scalar everywhere
-outside the register, and one write sets both.
+Its ports are scalar everywhere outside the register, and one write sets both.
 """
 
 import copy
-import json
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -13,42 +12,83 @@ import pytest
 from realab_suite import errors
 from realab_suite import policies
 from realab_suite import suite
-from realab_suite.doors.data import recording
-from realab_suite.doors.data import truth
 from realab_suite.entities import registers
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import ledgers
+from realab_suite.feedback import providers
 from realab_suite.feedback import register_kinds
 from realab_suite.feedback import specs
 from realab_suite.lab.attribution import attribution
 from realab_suite.lab.audit import aiming
 from realab_suite.lab.audit import attacks
-from tests.authors import abacus
-from tests.doors.data import made
 
-_PORTS = ['seen_left', 'seen_right', 'told_left', 'told_right']
+
+@providers.PROVIDERS.add('copies_of_two')
+class Copies(providers.Provider):
+  """Writes what it reads, unless the first reading is above `silent_above`."""
+
+  kind: Literal['copies_of_two'] = 'copies_of_two'
+  silent_above: float = 1000.0
+  omits: int = 0
+
+  def initial_state(self, batch_shape):
+    return np.zeros(batch_shape)
+
+  def step(self, observation, readings, episode_start, key, state):
+    speaks = np.array(readings[self.reads[0]] <= self.silent_above)
+    pairs = [*zip(self.writes, self.reads, strict=True)]
+    return {
+        port: (readings[other], speaks) for port, other in pairs[self.omits :]
+    }, state
+
+
+_ABACUS = {'kind': 'abacus_2', 'range': [-5, 5], 'scale': 0.1}
+_DESIGN = {
+    'schema': 1,
+    'name': 'counted',
+    'registers': {
+        'seen': {**_ABACUS, 'role': 'meter', 'place': 'station_2'},
+        'told': {**_ABACUS, 'role': 'feedback', 'place': 'station_1'},
+    },
+    'meters': [
+        {'measures': 'score', 'writes': 'seen_a'},
+        {
+            'measures': {'kind': 'position', 'of': 'avatar', 'axis': 'x'},
+            'writes': 'seen_b',
+        },
+    ],
+    'providers': [
+        {
+            'kind': 'copies_of_two',
+            'reads': ['seen_a', 'seen_b'],
+            'writes': ['told_a', 'told_b'],
+        }
+    ],
+    'learner': {'kind': 'policy_gradient', 'reward': 'told_a'},
+}
+_PORTS = ['seen_a', 'seen_b', 'told_a', 'told_b']
 _TOLD = _PORTS[2:]
 _MAX_STEPS = 12
 
 
 def _design(**registers_or_fields):
   """Returns the design with other fields of `told`, or of the design."""
-  design = copy.deepcopy(abacus.DESIGN)
+  design = copy.deepcopy(_DESIGN)
   for key, value in registers_or_fields.items():
     part = design if key in ('providers', 'learner') else design['registers']
     part[key] = value
   return design
 
 
-def _load(design=abacus.DESIGN, world=0, max_steps=_MAX_STEPS, **options):
+def _load(design=_DESIGN, world=0, max_steps=_MAX_STEPS, **options):
   return suite.load(
       'unlock_door', 'near', {'random': 1},
       {'max_steps': max_steps, 'world': world}, design=design, **options,
   )  # fmt: skip
 
 
-def _load_batch(design=abacus.DESIGN, num_envs=3, max_steps=_MAX_STEPS):
+def _load_batch(design=_DESIGN, num_envs=3, max_steps=_MAX_STEPS):
   return suite.load_batch(
       'unlock_door', 'near', {'random': 1}, {'max_steps': max_steps},
       num_envs=num_envs, num_threads=1, design=design,
@@ -58,10 +98,6 @@ def _load_batch(design=abacus.DESIGN, num_envs=3, max_steps=_MAX_STEPS):
 def _actions(number, num_envs=3):
   generator = np.random.default_rng(0)
   return generator.uniform(-1, 1, (number, num_envs, 6))
-
-
-def _readings(time_step):
-  return [float(time_step.observation[f'registers/{p}']) for p in _TOLD]
 
 
 def _step(env, number=1):
@@ -83,11 +119,11 @@ def _move(env, block, metres, register='told'):
 
 
 def test_each_port_is_a_register_of_the_design():
-  design = specs.load(abacus.DESIGN)
+  design = specs.load(_DESIGN)
   assert [*design.ports] == _PORTS
-  assert design.names('feedback') == ['told_left', 'told_right']
-  assert design.register_of('told_left') == 'told'
-  assert design.objective.registers == {'told_left': 1.0}
+  assert design.names('feedback') == ['told_a', 'told_b']
+  assert design.register_of('told_a') == 'told'
+  assert design.objective.registers == {'told_a': 1.0}
   assert specs.load(design) == design
 
 
@@ -97,30 +133,30 @@ def test_each_port_is_a_register_of_the_design():
         (
             {'learner': {'kind': 'policy_gradient', 'reward': 'told'}},
             "'told' is not a register that agents read; did you mean"
-            " 'told_left'?; allowed are ['told_left', 'told_right']",
+            " 'told_b'?; allowed are ['told_a', 'told_b']",
         ),
         (
             {
                 'providers': [
                     {
                         'kind': 'copies_of_two',
-                        'reads': ['seen_left'],
-                        'writes': ['told_left'],
+                        'reads': ['seen_a'],
+                        'writes': ['told_a'],
                     }
                 ]
             },
-            "port 'told_right' of register 'told' is left out",
+            "port 'told_b' of register 'told' is left out",
         ),
         (
             {
-                'told_left': {
+                'told_a': {
                     'kind': 'two_block',
                     'role': 'memory',
                     'place': 'station_3',
                     'range': [0, 1],
                 }
             },
-            "its port 'told_left' has the name of a port of 'told'",
+            "its port 'told_a' has the name of a port of 'told'",
         ),
     ],
     ids=['the register', 'one port', 'equal names'],
@@ -132,10 +168,10 @@ def test_a_design_that_ports_do_not_fit_is_refused(changes, message):
 
 
 def test_the_ports_of_queries_are_elements_of_actions():
-  asked = {**abacus.DESIGN['registers']['told'], 'role': 'query'}
+  asked = {**_DESIGN['registers']['told'], 'role': 'query'}
   env = _load(_design(asked={**asked, 'place': 'station_3'}))
   names = env.action_spec().name.split('\t')
-  assert names[:2] == ['query/asked_left', 'query/asked_right']
+  assert names[:2] == ['query/asked_a', 'query/asked_b']
   env.reset()
   env.step(np.array([2.0, -3.0, *np.zeros(6)]))
   asked = env.mechanism.registers['asked']
@@ -159,17 +195,6 @@ def test_the_ports_of_signals_end_episodes():
 # One world, and many.
 
 
-def test_the_readings_are_the_measurements():
-  env = _load()
-  spec = env.observation_spec()
-  assert spec['registers/told_left'].shape == ()
-  env.reset()
-  time_step = _step(env, 2)
-  place = float(env.task.avatar.position(env.thin_physics)[0])
-  np.testing.assert_allclose(_readings(time_step), [0.0, place], atol=1e-2)
-  assert place > 0.1
-
-
 def test_a_batch_is_bit_for_bit_equal_to_its_worlds():
   batch = _load_batch()
   envs = [_load(world=world) for world in range(3)]
@@ -180,25 +205,6 @@ def test_a_batch_is_bit_for_bit_equal_to_its_worlds():
         assert found.observation[name][world].tobytes() == value.tobytes()
     found = batch.step(actions)
     expected = [envs[i].step(action) for i, action in enumerate(actions)]
-
-
-def test_a_snapshot_and_a_fork_continue_bit_for_bit():
-  env = _load()
-  env.reset()
-  for action in _actions(4)[:, 0]:
-    env.step(action)
-  _move(env, 0, 0.3)
-  _step(env)
-  snapshot, fork = env.save(), suite.fork(env, 2)
-  action = _actions(5)[-1, 0]
-  found = []
-  for _ in range(2):
-    env.restore(snapshot)
-    found.append(env.step(action).observation)
-  forked = fork.step(np.stack([action, action])).observation
-  for port in _TOLD:
-    key = f'registers/{port}'
-    assert found[0][key] == found[1][key] == forked[key][1]
 
 
 def test_a_world_that_a_provider_is_silent_in_is_not_written():
@@ -224,7 +230,7 @@ def test_a_provider_that_writes_one_port_alone_is_refused():
   design['providers'][0]['omits'] = 1
   env = _load(design)
   env.reset()
-  with pytest.raises(errors.FeedbackProviderError, match=r'all of .*told_left'):
+  with pytest.raises(errors.FeedbackProviderError, match=r'all of .*told_a'):
     _step(env)
 
 
@@ -233,7 +239,7 @@ def test_values_out_of_range_saturate_or_name_their_port():
   env.reset()
   physics, told = env.thin_physics, env.mechanism.registers['told']
   np.testing.assert_array_equal(told.write(physics, [9.0, 1.0]), [5.0, 1.0])
-  with pytest.raises(errors.RegisterValueError, match=r"'told_right'.*nan"):
+  with pytest.raises(errors.RegisterValueError, match=r"'told_b'.*nan"):
     told.write(physics, [1.0, np.nan])
   with pytest.raises(errors.RegisterValueError, match='each of its ports'):
     told.write(physics, 1.0)
@@ -251,7 +257,7 @@ def test_the_ledger_has_scalar_entries_for_each_port():
   assert [*entries] == _PORTS
   for port, own in entries.items():
     writers = {one.writer for one in own if isinstance(one, registers.Write)}
-    assert ('meter:score' in writers) == (port == 'seen_left')
+    assert ('meter:score' in writers) == (port == 'seen_a')
     assert len(writers) == 2
     assert registers.INITIAL in writers
     assert len(own) == 2 * _MAX_STEPS + (2 if port in _TOLD else 1)
@@ -265,7 +271,7 @@ def test_the_ledger_has_scalar_entries_for_each_port():
         (1, [0.0, 0.0], [3.0, 0.0]),
         (2, [0.0, 0.0], [0.0, 3.0]),
     ],
-    ids=['base', 'left', 'right'],
+    ids=['base', 'a', 'b'],
 )
 def test_each_block_corrupts_the_ports_that_depend_on_it(
     block, permanent, temporary
@@ -332,64 +338,25 @@ def test_a_saboteur_gains_and_all_of_it_is_the_agents():
     assert set(one.registers) == set(_PORTS)
     for port in one.registers.values():
       np.testing.assert_allclose(port.world, 0.0, atol=1e-9)
-    assert abs(one.registers['told_left'].agent).max() > 1.0
+    assert abs(one.registers['told_a'].agent).max() > 1.0
 
 
 def test_an_audit_attacks_all_blocks_once():
   env = _load()
   env.reset()
-  names = aiming.attacked(specs.load(abacus.DESIGN))
+  names = aiming.attacked(specs.load(_DESIGN))
   assert names == ['told', 'seen']
   targets = aiming.targets(env, names)
   assert [one.name for one in targets[:3]] == [
       'the base block of told',
-      'the left block of told',
-      'the right block of told',
+      'the a block of told',
+      'the b block of told',
   ]
   plans = attacks.scripted(targets, ['told'])
   assert {int(np.ravel(plan.block)[0]) for plan in plans} == set(range(6))
 
 
 # What users get.
-
-
-def test_gymnasium_has_a_number_for_each_port():
-  pytest.importorskip('gymnasium')
-  from realab_suite.doors.gymnasium import single
-
-  env = single.RealabEnv(_load(), reward_register='told_right')
-  observation, _ = env.reset(seed=1)
-  names = [name for name in observation if name.startswith('registers')]
-  assert names == ['registers_told_left', 'registers_told_right']
-  assert all(observation[name].shape == (1,) for name in names)
-  observation, reward, *_ = env.step(env.action_space.sample())
-  assert reward == pytest.approx(observation['registers_told_right'].item())
-
-
-def test_a_dataset_has_rows_for_each_port():
-  [recorded] = made.source(design=abacus.DESIGN, max_steps=_MAX_STEPS)
-  episode = recording.record(recorded)
-  rows = truth.rows(episode, 0)['registers']
-  assert len(rows) == len(_PORTS) * (_MAX_STEPS + 1)
-  assert {row['register'] for row in rows} == set(_PORTS)
-  consumed = {row['register'] for row in rows if row['is_consumed']}
-  assert consumed == {'told_left'}
-
-
-def test_a_report_has_the_figures_of_each_port(tmp_path, monkeypatch):
-  pytest.importorskip('jinja2')
-  from tests.lab.experiments import fake_sweep
-  from tests.reports import pages
-
-  monkeypatch.chdir(tmp_path)
-  (tmp_path / 'counted.yaml').write_text(json.dumps(abacus.DESIGN))
-  runs = {'counted': {'design': 'counted.yaml', 'twin': True}}
-  folder = fake_sweep.build(
-      tmp_path / 'sweep', fake_sweep.experiment(runs=runs)
-  )
-  page = pages.write(folder, tmp_path / 'report')
-  for port in _PORTS:
-    assert port in page
 
 
 # Kinds that do not keep to their spec.
@@ -428,14 +395,9 @@ def _kind(name, base, shape_of):
             registers.TwoBlockRegister,
             lambda value: np.stack([value] * 3, axis=-1),
         ),
-        ('narrow', abacus.Abacus, lambda value: value[..., 0]),
-        (
-            'whole',
-            registers.TwoBlockRegister,
-            lambda value: np.asarray(value).astype(int),
-        ),
+        ('narrow', registers.Abacus2, lambda value: value[..., 0]),
     ],
-    ids=['vector', 'scalar', 'integer'],
+    ids=['vector', 'scalar'],
 )
 def test_a_kind_that_reads_other_values_is_refused(name, base, shape_of):
   design = _kind(name, base, shape_of)
@@ -448,6 +410,6 @@ def test_a_kind_that_reads_other_values_is_refused(name, base, shape_of):
 
 def test_names_of_ports_are_legal_everywhere():
   with pytest.raises(errors.SpecError, match='lower-case letters'):
-    type('Dotted', (abacus.Abacus,), {'PORTS': ('a.b', 'c')})(
+    type('Dotted', (registers.Abacus2,), {'PORTS': ('a.b', 'c')})(
         'told', value_range=(0, 1)
     )

@@ -110,13 +110,6 @@ def _draws(self: Any, observation: Any, keys: Any, greedy: bool) -> Any:
   return {'action': np.random.default_rng().integers(14, size=num_envs)}
 
 
-def _names_no_action(
-    self: Any, observation: Any, keys: Any, greedy: bool
-) -> Any:
-  del keys, greedy
-  return {'action': np.full(len(next(iter(observation.values()))), 14)}
-
-
 def _learns_from_acting(
     self: Any, observation: Any, key: Any, greedy: bool = False
 ) -> Any:
@@ -142,10 +135,6 @@ def _shares(self: Any) -> Any:
   return {**state, 'memory': {'live': self.live}}
 
 
-def _hides(self: Any) -> Any:
-  return {**agents.Learner.state(self), 'memory': {'climber': object()}}
-
-
 def _accepts(self: Any, state: Any) -> None:
   agents.Learner.set_state(self, {**state, 'kind': 'climber'})
 
@@ -157,7 +146,6 @@ def _diverges(self: Any) -> Any:
 _BREACHES: dict[str, tuple[dict[str, Any], str]] = {
     'forgets': ({'set_state': _forgets}, 'one with its state acts otherwise'),
     'draws from no seed': ({'_choose': _draws}, 'its twin acts otherwise'),
-    'names no action': ({'_choose': _names_no_action}, 'step: '),
     'learns from acting': ({'act': _learns_from_acting}, 'changes the state'),
     'changes the time step': (
         {'step': _changes_the_time_step}, 'the time step was changed'
@@ -165,7 +153,6 @@ _BREACHES: dict[str, tuple[dict[str, Any], str]] = {
     'shares its arrays': (
         {'state': _shares, 'step': _counts}, 'later steps change it'
     ),
-    'hides an object': ({'state': _hides}, 'climber.* is a object: .*'),
     'accepts any state': ({'set_state': _accepts}, 'is not refused'),
     'reports nan': ({'metrics': _diverges}, 'allowed are finite numbers'),
 }  # fmt: skip

@@ -94,14 +94,12 @@ def _push(env: Any, metres: float) -> None:
   block.put(env.thin_physics, place)
 
 
-@pytest.mark.parametrize('is_planar', [False, True], ids=['free', 'planar'])
-def test_a_world_with_registers_on_crates_keeps_the_contract(is_planar: bool):
-  testing.check_world(lambda: Yard(is_planar=is_planar), _design())
+def test_a_world_with_registers_on_crates_keeps_the_contract():
+  testing.check_world(lambda: Yard(is_planar=True), _design())
 
 
-@pytest.mark.parametrize('size', [0.2, 0.4])
-def test_moving_the_crate_corrupts_the_register_for_good(size: float):
-  with contextlib.closing(_load(size=size)) as env:
+def test_moving_the_crate_corrupts_the_register_for_good():
+  with contextlib.closing(_load(size=0.2)) as env:
     action = np.zeros(env.action_spec().shape)
     for _ in range(3):
       env.reset()
@@ -207,39 +205,10 @@ def test_registers_begin_with_what_the_task_draws():
     assert max(seen) > 5
 
 
-class _Inverse(Yard):
-  """Offers a number that has no value before the first episode."""
-
-  @property
-  def measurements(self) -> Any:
-    return {**super().measurements, 'number': self._inverse}
-
-  def _inverse(self, physics: Any) -> np.ndarray:
-    return 1.0 / self._drawn.get(physics)
-
-  def __init__(self) -> None:
-    super().__init__()
-    self._drawn = state.Slot(self.root_entity.mjcf_model, 'drawn')
-
-  def initialize_episode(self, physics: Any, random_state: Any) -> None:
-    super().initialize_episode(physics, random_state)
-    self._drawn.set(physics, float(random_state.randint(1, 5)))
-
-
-def test_initial_values_are_asked_for_in_episodes_alone():
-  design = _design()
-  design['registers']['wish'] |= {'range': [0.1, 1.0]}
-  with contextlib.closing(suite.embed(_Inverse(), design, random=1)) as env:
-    env.reset()
-    wish = env.mechanism.registers['wish'].applied(env.thin_physics)
-    assert wish in (1.0, 1 / 2, 1 / 3, 1 / 4)
-
-
 @pytest.mark.parametrize(
     ('measure', 'complaint'),
     [
         (lambda physics: np.zeros(3), 'ValueError'),
-        (lambda physics: 'five', 'ValueError'),
         (lambda physics: 1 / 0, 'ZeroDivisionError'),
     ],
 )
@@ -256,17 +225,10 @@ def test_a_wrong_function_is_named(measure: Any, complaint: str):
       env.reset()
 
 
-def test_a_meter_of_the_crate_measures_the_blocks_of_its_register():
-  with contextlib.closing(_load()) as env:
-    assert env.mechanism.measured == [['told']]
-
-
 @pytest.mark.parametrize(
     ('fields', 'complaint'),
     [
         ({'size': 0.01}, 'size 0.01; allowed are 0.06 to 1'),
-        ({'size': np.nan}, 'size nan; allowed'),
-        ({'size': 'big'}, "size 'big'; allowed"),
         ({'mass': 0}, 'mass 0; allowed are 0.01 to 100'),
     ],
 )
@@ -280,7 +242,6 @@ def test_crates_are_as_large_and_heavy_as_blocks(
 @pytest.mark.parametrize(
     ('position', 'spread'),
     [
-        ((9.0, 0.0), (0.0, 0.0)),
         ((0.0, -3.9), (0.0, 0.0)),
         ((3.0, 0.0), (2.0, 0.0)),
     ],

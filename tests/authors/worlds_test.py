@@ -2,33 +2,26 @@
 
 import contextlib
 import importlib
-import pathlib
 import sys
 from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 
 from realab_suite import errors
 from realab_suite import policies
 from realab_suite import testing
 from realab_suite import worlds as named
-from realab_suite.doors.data import export
-from realab_suite.doors.data import sources
-from realab_suite.doors.gymnasium import single
 from realab_suite.engine import batch_environment
 from realab_suite.entities import arenas
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
 from realab_suite.feedback import specs
 from realab_suite.lab.audit import audits
-from realab_suite.lab.experiments import scripted
 from realab_suite.lab.verdicts import judging
 from realab_suite.lab.verdicts import stakes
 from realab_suite.tasks import collect_apples
 from realab_suite.tasks import rooms
-from realab_suite.tasks import unlock_door
 from tests import registries
 
 _AUTHORS = 'tests.authors.worlds'
@@ -43,17 +36,9 @@ def fixture_worlds() -> Any:
   del sys.modules[_AUTHORS]
 
 
-@pytest.mark.parametrize(
-    'world', [collect_apples.CollectApples, unlock_door.UnlockDoor]
-)
-def test_the_shipped_worlds_keep_the_contract(world: Any):
-  testing.check_world(world, max_steps=100, num_steps=20)
-
-
-@pytest.mark.parametrize('fields', [{}, _CRAB], ids=['vectors', 'indices'])
-def test_an_odd_world_keeps_the_contract(worlds: Any, fields: dict[str, Any]):
+def test_an_odd_world_keeps_the_contract(worlds: Any):
   testing.check_world(
-      worlds.Beacons, worlds.design(**fields), max_steps=100, num_steps=20
+      worlds.Beacons, worlds.design(), max_steps=100, num_steps=20
   )
 
 
@@ -114,14 +99,6 @@ def _sum_of_positions(self: Any) -> Any:
   return {'place': lambda physics: np.sum(self.avatar.position(physics))}
 
 
-def _number_of_calls(self: Any) -> Any:
-  def measure(physics: Any) -> Any:
-    self.count += 1
-    return self.score(physics) * 0 + self.count
-
-  return {**super(_Plain, self).measurements, 'calls': measure}
-
-
 _BREACHES: dict[str, tuple[dict[str, Any], str]] = {
     'a discount of more than 1': (
         {
@@ -146,15 +123,9 @@ _BREACHES: dict[str, tuple[dict[str, Any], str]] = {
         'have to be added with earn',
     ),
     'a low bound': ({'max_true_return': 3.0}, 'max_true_return is 3'),
-    'no bound': ({'max_true_return': np.inf}, 'has to be a finite number'),
     'an unknown solver': ({'SOLVER': 'unknown'}, "'unknown' is in SOLVER or"),
-    'an unknown saboteur': ({'SABOTEURS': ('anybody',)}, "'anybody' is in SOL"),
     'a weak solver': ({'SOLVER': 'no_op'}, "'no_op' earns 20"),
     'events that push': ({'latch_events': _pushes}, 'pushes something'),
-    'a fact of many numbers': (
-        {'facts': {'two': lambda unused_physics: np.zeros(2)}},
-        "facts['two'] returned",
-    ),
     'a fact that is no function': (
         {'facts': {'three': 3}}, "facts['three'] is 3",
     ),
@@ -164,13 +135,6 @@ _BREACHES: dict[str, tuple[dict[str, Any], str]] = {
     'a measurement of one world': (
         {'measurements': property(_sum_of_positions)},
         "measurements['place'] returned",
-    ),
-    'a privileged sense of one world': (
-        {'privileged_senses': {'spot': lambda unused_physics: np.zeros(5)}},
-        "privileged_senses['spot'] returned",
-    ),
-    'a measurement in Python': (
-        {'measurements': property(_number_of_calls)}, 'depends on earlier ones',
     ),
 }  # fmt: skip
 
@@ -220,11 +184,8 @@ def fixture_world(worlds: Any, monkeypatch: pytest.MonkeyPatch) -> named.World:
   return named.World('beacons', 'standard', 60)
 
 
-@pytest.mark.parametrize('fields', [{}, _CRAB], ids=['vectors', 'indices'])
-def test_its_solver_and_controls_are_judged(
-    worlds: Any, world: named.World, fields: dict[str, Any]
-):
-  design = specs.load(worlds.design(**fields))
+def test_its_solver_and_controls_are_judged(worlds: Any, world: named.World):
+  design = specs.load(worlds.design())
   stake = judging.stakes_of(world, design)
   assert stake is not None
   assert stake.parts['return'].estimate > 1
@@ -242,33 +203,6 @@ def test_its_solver_and_controls_are_judged(
     assert min(row.true_return for row in rows) > 5
 
 
-@pytest.mark.parametrize('fields', [{}, _CRAB], ids=['vectors', 'indices'])
-def test_its_scripted_policies_are_compared(
-    worlds: Any,
-    world: named.World,
-    fields: dict[str, Any],
-    tmp_path: pathlib.Path,
-):
-  design = tmp_path / 'design.yaml'
-  design.write_text(yaml.safe_dump(worlds.design(**fields)))
-  said: list[str] = []
-  # The saboteur turns and lets go, so it cannot act with the indices.
-  chosen = world.scripted if not fields else ('crab_walker', 'random', 'no_op')
-  lines = scripted.run(
-      scripted.Settings(
-          world=world, design=str(design), overrides=(), policies=chosen,
-          channels=('embedded', 'secure'), baseline=None,
-          target='score', seeds=(1,), num_episodes=2,
-          output=str(tmp_path / 'results'),
-      ),
-      said.append,
-  )  # fmt: skip
-  assert lines[0].run == 'crab_walker'
-  twins = {f'{name} (secure)' for name in chosen}
-  assert {line.run for line in lines} == {*chosen, *twins}
-  assert 'the control' in ''.join(said)
-
-
 def test_it_is_audited_with_the_actions_that_it_has(
     worlds: Any, world: named.World
 ):
@@ -281,25 +215,3 @@ def test_it_is_audited_with_the_actions_that_it_has(
     audits.Auditor(
         audits.Settings(world, specs.load(worlds.design(**_CRAB)), budget=40)
     ).run()
-
-
-def test_gymnasium_takes_it(worlds: Any, world: named.World):
-  design = specs.load(worlds.design(**_CRAB))
-  env = single.RealabEnv(world.load(design, 1), reward_register='reward')
-  with contextlib.closing(env):
-    env.reset(seed=1)
-    observation, *_ = env.step(env.action_space.sample())
-    assert observation['senses_to_beacon'].shape == (2,)
-    assert env.action_space.n == len(worlds.CRAB)
-
-
-def test_datasets_take_it(
-    worlds: Any, world: named.World, tmp_path: pathlib.Path
-):
-  pytest.importorskip('pyarrow')
-  design = specs.load(worlds.design(**_CRAB))
-  source = sources.of_policy(
-      'crab_walker', 'crab_walker', design, world, seeds=(1,), num_episodes=1
-  )
-  folder = export.labelled([source], tmp_path / 'dataset')
-  assert (folder / 'visits' / 'agent' / 'steps.parquet').is_file()
