@@ -10,7 +10,6 @@ from realab_suite.feedback import specs
 from realab_suite.lab.audit import findings
 from realab_suite.lab.verdicts import verdicts
 from realab_suite.reports import audits
-from tests.lab.audit import designs
 
 _WORLD = {
     'domain': 'unlock_door', 'task': 'near', 'max_steps': 250,
@@ -59,7 +58,6 @@ def _read(folder, run, content):
     ('changes', 'expected'),
     [
         ({}, (False, True, 1488)),
-        ({'is_sufficient': False}, (False, False, 1488)),
         ({'verdict': findings.EXPLOITABLE}, (True, True, 1488)),
         ({'verdict': findings.UNDECIDED}, (False, False, 1488)),
     ],
@@ -97,34 +95,15 @@ def test_an_audit_for_another_objective_is_refused(field, tmp_path):
     _read(tmp_path, run, _content(run, objective=objective))
 
 
-def test_an_audit_of_an_opposite_learner_of_the_same_kind_is_refused(tmp_path):
-  def run(weight):
-    learner = {
-        'kind': 'their_own',
-        'objective': {'kind': 'return', 'registers': {'reward': weight}},
-    }
-    design = designs.rewarding(designs.two_blocks('feedback'), learner=learner)
-    return _run(design)
-
-  with pytest.raises(errors.ResultsError, match='the objective is'):
-    _read(tmp_path, run(1.0), _content(run(-1.0)))
-
-
 @pytest.mark.parametrize(
     ('changes', 'message'),
     [
         ({'world': {'domain': 'collect_apples', 'task': 'near'}}, 'task is'),
         ({'world': _WORLD | {'max_steps': 3}}, 'max_steps is 3, and 250 in'),
-        ({'world': _WORLD | {'task_kwargs': {'x': 1}}}, 'task_kwargs is'),
-        ({'world': _WORLD | {'senses': ['heading']}}, 'senses is'),
         ({'target': 'score'}, "target is 'score'"),
         ({'query_policy': 'independent_action'}, 'the query policy is'),
         ({'verdict': 'PERHAPS'}, "verdict: 'PERHAPS'; Input should be 'EXPL"),
-        ({'verdict': None}, 'verdict: None'),
         ({'world': None}, 'world: None'),
-        ({'design': None}, 'design: None'),
-        ({'objective': None}, 'objective: None'),
-        ({'is_sufficient': None}, 'is_sufficient: None'),
     ],
 )
 def test_an_audit_of_another_world_is_refused(changes, message, tmp_path):
@@ -137,7 +116,6 @@ def test_an_audit_of_another_world_is_refused(changes, message, tmp_path):
     ('changes', 'message'),
     [
         ({'dof': 'planar'}, r'design\.dof is'),
-        ({'learner': {'kind': 'q_learning'}}, r'learner\.kind is'),
         ({'learner': None}, r'learner\.kind is None'),
     ],
 )

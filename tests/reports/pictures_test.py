@@ -62,14 +62,6 @@ def test_plots_of_any_number_of_runs_are_drawn_without_a_warning(
       assert len(image.getcolors(2**24)) > 50
 
 
-def test_a_plot_shows_the_path(tmp_path, track):
-  plots.draw_trajectories({'run': track}, tmp_path / 'moved.png')
-  track.positions = [track.positions[0]] * len(track.positions)
-  plots.draw_trajectories({'run': track}, tmp_path / 'still.png')
-  moved = (tmp_path / 'moved.png').read_bytes()
-  assert moved != (tmp_path / 'still.png').read_bytes()
-
-
 @pytest.fixture(name='canvases')
 def _canvases(monkeypatch):
   """The figures that plots are made of."""
@@ -97,20 +89,6 @@ def test_titles_of_a_time_line_do_not_collide(recorded, canvases):
     assert not one.overlaps(other)
 
 
-def test_the_legend_names_the_objects_and_blocks_of_every_track(
-    recorded, canvases
-):
-  tracks = {'first': recorded, 'second': _track('decoupled_approval')}
-  plots.draw_trajectories(tracks, 'world.png')
-  [canvas] = canvases
-  entries = {text.get_text() for text in canvas.legends[0].get_texts()}
-  assert {
-      'pad', 'other object', 'large apple', 'door', 'query: base block',
-      'feedback: offset block', 'meter: base block',
-  } <= entries  # fmt: skip
-  assert 'pressed pad' not in entries
-
-
 def test_a_world_without_registers_is_drawn(tmp_path):
   settings = small.settings(
       tmp_path / 'new', design='none', policies=('no_op',), channels=()
@@ -118,23 +96,6 @@ def test_a_world_without_registers_is_drawn(tmp_path):
   scripted.run(settings, lambda line: None, plots.draw)
   drawn = [path.name for path in (tmp_path / 'new' / 'plots').iterdir()]
   assert drawn == ['trajectories.png']
-
-
-def test_a_strip_grows_by_a_lane_per_feedback_register(recorded):
-  with_feedback = films.draw_strip('run', recorded, 480)
-  without = films.draw_strip('run', _track('none'), 480)
-  assert with_feedback.shape[1:] == without.shape[1:] == (480, 3)
-  assert with_feedback.shape[0] > without.shape[0]
-  # Frames have the even sizes that codecs want.
-  assert (films.HEIGHT + with_feedback.shape[0]) % 2 == 0
-  assert not any(width % 2 for width in films.WIDTHS.values())
-
-
-def test_a_strip_shows_what_was_read(track):
-  before = films.draw_strip('run', track, 480)
-  track.registers['reward'].reading[-1] += 7.0
-  after = films.draw_strip('run', track, 480)
-  assert (before != after).any()
 
 
 def test_pictures_show_corruption_that_a_meter_passed_on(tmp_path, track):
@@ -148,13 +109,6 @@ def test_pictures_show_corruption_that_a_meter_passed_on(tmp_path, track):
       (tmp_path / name).read_bytes() for name in ('before.png', 'after.png')
   )
   assert before != after
-
-
-def test_a_film_of_another_kind_is_refused(tmp_path):
-  with pytest.raises(errors.ResultsError, match=r"'\.gif'; allowed.*webp"):
-    with films.film(None, tmp_path / 'film.gif', 'run'):
-      pass
-  assert not list(tmp_path.iterdir())
 
 
 # In one test, because each that renders is run by a process of its own.

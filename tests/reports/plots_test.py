@@ -6,7 +6,6 @@ import pytest
 from realab_suite.lab.experiments import sweep_results
 from realab_suite.reports import numbers
 from realab_suite.reports import plots
-from tests.lab.experiments import fake_sweep
 
 
 @pytest.fixture(name='canvases')
@@ -20,12 +19,6 @@ def _canvases(monkeypatch):
       lambda canvas: canvases.append(canvas) or to_svg(canvas),
   )
   return canvases
-
-
-@pytest.fixture(scope='module', name='one_seed')
-def _one_seed(tmp_path_factory):
-  path = tmp_path_factory.mktemp('one') / 'results'
-  return fake_sweep.build(path, fake_sweep.experiment(seeds=[0]))
 
 
 def _drawn(folder, chart, canvases, run=None):
@@ -42,22 +35,6 @@ def _drawn(folder, chart, canvases, run=None):
   return canvas
 
 
-def _entries(canvas):
-  return [text.get_text() for text in canvas.legends[0].get_texts()]
-
-
-@pytest.mark.parametrize(
-    ('run', 'is_symlog'), [('decoupled', False), ('reward', True)]
-)
-def test_an_axis_is_symlog_if_observed_returns_are_much_larger(
-    folder, canvases, run, is_symlog
-):
-  axes = _drawn(folder, plots.learning, canvases, run).axes
-  titles = [ax.get_title() for ax in axes if ax.get_title()]
-  assert ('observed return (units), symlog' in titles) == is_symlog
-  assert axes[1].get_yscale() == ('symlog' if is_symlog else 'linear')
-
-
 def test_curves_and_bands_keep_away_from_the_edges(folder, canvases):
   for ax in _drawn(folder, plots.learning, canvases).axes:
     low, high = ax.get_ylim()
@@ -71,17 +48,6 @@ def test_curves_and_bands_keep_away_from_the_edges(folder, canvases):
     low, high = scale(np.array([low, high]))
     assert low + 0.05 * (high - low) < values.min()
     assert values.max() < high - 0.05 * (high - low)
-
-
-def test_the_legend_names_what_is_drawn(folder, one_seed, canvases):
-  canvas = _drawn(folder, plots.learning, canvases)
-  assert _entries(canvas) == [
-      'design', 'its secure twin', 'its baseline', '95 % interval over seeds',
-  ]  # fmt: skip
-  canvases.clear()
-  # One seed has no interval over seeds.
-  canvas = _drawn(one_seed, plots.learning, canvases, 'decoupled')
-  assert _entries(canvas) == ['design', 'its baseline']
 
 
 def test_a_curve_has_a_point_per_length_of_an_episode():
@@ -105,14 +71,6 @@ def test_a_curve_has_a_point_per_length_of_an_episode():
   assert plots.curve(odd, 12, fewest=2) == {30: 3.0}
 
 
-def test_a_band_has_the_steps_shared_by_its_seeds():
-  one = plots.band(
-      {0: {1: 1.0, 2: 9.0, 3: 3.0}, 1: {1: 3.0, 3: 5.0}, 2: {1: 2.0}, 3: {}}
-  )
-  assert one.steps.tolist() == [1, 3]
-  assert one.mean.tolist() == [2.0, 4.0]
-
-
 def test_a_band_is_the_interval_over_seeds():
   one = plots.band({0: {100: 1.0, 200: 5.0}, 1: {100: 2.0}})
   assert one.steps.tolist() == [100, 200]
@@ -124,15 +82,3 @@ def test_thirty_designs_have_thirty_styles():
   names = [f'design {i}' for i in range(30)]
   looks = plots.styles(names)
   assert len(set(looks.values())) == 30
-
-
-def test_points_and_intervals_are_drawn_whole(folder, canvases):
-  [ax] = _drawn(folder, plots.plane, canvases).axes
-  (left, right), (low, high) = ax.get_xlim(), ax.get_ylim()
-  assert len(ax.lines) > 9
-  for line in ax.lines:
-    x, y = np.asarray(line.get_xdata()), np.asarray(line.get_ydata())
-    assert (left < x).all()
-    assert (x < right).all()
-    assert (low < y).all()
-    assert (y < high).all()

@@ -13,11 +13,8 @@ from realab_suite import errors
 from realab_suite import suite
 from realab_suite import worlds
 from realab_suite.evaluation import results
-from realab_suite.lab.experiments import experiment_specs
 from realab_suite.lab.experiments import jobs
-from realab_suite.lab.experiments import replays
 from realab_suite.lab.experiments import scheduler
-from realab_suite.lab.experiments import storage
 from realab_suite.lab.experiments import sweep_results
 from realab_suite.lab.experiments import tables
 from realab_suite.lab.experiments import training
@@ -69,31 +66,6 @@ def test_all_kinds_of_tables_are_in_the_page_and_in_markdown(page, output):
     assert f'{title}</h2>' in page
 
 
-def test_a_typical_episode_is_the_one_of_median_corruption(folder):
-  run = sweep_results.load(folder).runs['reward']
-  corruption = sorted(row.corruption for row in run.rows)
-  row = replays.typical_row(run)
-  assert row.corruption == corruption[(len(corruption) - 1) // 2]
-  first = replays.first_row(run)
-  assert (first.seed, first.world) == (1_000_000, 0)
-
-
-def test_intervals_are_over_what_the_page_says(folder, page, tmp_path):
-  assert 'with 95 % intervals over seeds, in brackets' in pages.text(page)
-  runs = {'decoupled': fake_sweep.EXPERIMENT['runs']['decoupled']}
-  one = fake_sweep.experiment(runs=runs, baselines=['random'], seeds=[0])
-  single = pages.write(
-      fake_sweep.build(tmp_path / 'sweep', one), tmp_path / 'out'
-  )
-  assert 'intervals over the episodes of one seed, in br' in pages.text(single)
-
-
-def test_what_is_cut_off_can_be_scrolled_and_says_so(page):
-  assert page.count('<table>') == page.count('tabindex="0"><table>') > 4
-  pictures = page.count('<figure class="scroll" tabindex="0"><img')
-  assert pictures == page.count('<img') == page.count('Swipe sideways') > 2
-
-
 def test_the_page_needs_no_other_file(page):
   addresses = re.findall(r'(?:src|href|poster)="([^"]*)"', page)
   assert len(addresses) > 3
@@ -132,8 +104,9 @@ def test_the_same_results_give_the_same_bytes_in_another_process(
 
 def test_markup_in_texts_is_escaped(tmp_path):
   one = fake_sweep.experiment(
-      description='<script>alert(2)</script>', baselines=['random'],
-      seeds=[0, 1],
+      description='<script>alert(2)</script>', baselines=[], seeds=[0],
+      runs={'reward': {'design': 'instantaneous_reward'}},
+      evaluation={'episodes': 2},
   )  # fmt: skip
   page = pages.write(
       fake_sweep.build(tmp_path / 'sweep', one), tmp_path / 'out'
@@ -142,25 +115,8 @@ def test_markup_in_texts_is_escaped(tmp_path):
   assert '<script>alert(2)</script>' in pages.text(page)
 
 
-def test_hostile_names_are_refused(tmp_path):
-  hostile = '<b onclick=alert(1)>$x$ "&|`'
-  one = fake_sweep.experiment(baselines=['random'], seeds=[0, 1])
-  run = experiment_specs.RunSpec(
-      design='instantaneous_reward', overrides=('dof=planar',)
-  )
-  one = one.model_copy(update={'runs': {hostile: run}})
-  folder = fake_sweep.build(tmp_path / 'sweep', one)
-  with pytest.raises(errors.ResultsError, match='should match pattern'):
-    sweep_results.load(folder)
-
-
-def test_the_template_is_shipped():
-  cfg = (_ROOT / 'setup.cfg').read_text()
-  assert 'realab_suite.reports = templates/*.j2' in cfg
-
-
 def test_unfinished_runs_are_named_and_left_out(tmp_path):
-  one = fake_sweep.experiment()
+  one = fake_sweep.experiment(evaluation={'episodes': 5})
   left_out = (('reward', 1), *(('decoupled', seed) for seed in one.seeds))
   folder = fake_sweep.build(tmp_path / 'sweep', one, left_out)
   page = pages.write(folder, tmp_path / 'out')
@@ -168,7 +124,7 @@ def test_unfinished_runs_are_named_and_left_out(tmp_path):
   assert '17 of 21 finished' in text
   assert 'reward, seed 1: at 4,000 of 20,000 control steps' in text
   assert 'There are no figures for decoupled: no seed has finished.' in text
-  assert pages.cells(page, 'Returns and hacked episodes', 'reward')[2] == '80'
+  assert pages.cells(page, 'Returns and hacked episodes', 'reward')[2] == '10'
   rows = [
       row
       for seed in (0, 2)
@@ -210,16 +166,6 @@ def test_a_sweep_that_has_only_begun_has_a_report(tmp_path):
   assert 'reward.secure, seed 2: not started' in text
 
 
-def test_a_report_on_calibration_seeds_says_so(tmp_path):
-  one = fake_sweep.experiment(
-      runs={'reward': fake_sweep.EXPERIMENT['runs']['reward']}
-  )
-  folder = fake_sweep.build(tmp_path / 'sweep', one, calibration=True)
-  text = pages.text(pages.write(folder, tmp_path / 'out'))
-  assert 'calibration seeds, which were used to choose settings' in text
-  assert 'With one seed, intervals are over its episodes' in text
-
-
 def test_a_world_that_is_not_imported_is_named_before_any_work(
     folder, tmp_path, monkeypatch
 ):
@@ -235,18 +181,6 @@ def test_a_world_that_is_not_imported_is_named_before_any_work(
     html_page.write(folder, tmp_path, said.append)
   assert not said
   assert not list(tmp_path.iterdir())
-
-
-def test_a_folder_without_a_sweep_is_refused(tmp_path):
-  with pytest.raises(errors.ResultsError, match=r'no sweep\.json'):
-    sweep_results.load(tmp_path)
-
-
-def test_a_wrong_description_is_refused(own_folder):
-  content = {'experiment': 'x', 'jobs': []}
-  storage.write_json(own_folder / scheduler.SWEEP, content)
-  with pytest.raises(errors.ResultsError, match=r'sweep\.json: calibration'):
-    sweep_results.load(own_folder)
 
 
 def test_a_corrupt_row_is_named_by_file_and_line(own_folder):
@@ -288,7 +222,7 @@ def test_changed_results_are_refused(own_folder):
     sweep_results.load(own_folder)
 
 
-@pytest.mark.parametrize('line', [b'{"step": 1', b'3', b'"ab"', b'[1]'])
+@pytest.mark.parametrize('line', [b'{"step": 1', b'3'])
 def test_a_corrupt_point_of_a_curve_is_named(own_folder, line):
   pages.spoil(
       own_folder, 'reward', 1, training.CURVE,

@@ -73,15 +73,6 @@ def test_a_saboteur_is_no_control(tmp_path):
   assert (cell.rates, cell.label) == ({}, '')
 
 
-def test_an_agent_with_the_name_of_the_solver_is_no_control(tmp_path):
-  runs = _runs('apple_seeker', left_out=['solver', 'twin'])
-  card = scorecards.make(
-      [_folder(tmp_path / 'one', *runs, name='apple_seeker')]
-  )
-  cell = card.cells[_NEAR, 'apple_seeker (agent)']
-  assert cell.reasons[_Why.BASELINE] == 'no solver acted beside it'
-
-
 def test_a_sweep_needs_the_solver_as_its_control(tmp_path):
   # With a twin, its transplants would be the control of the learner.
   run = {**fake_sweep.EXPERIMENT['runs']['reward'], 'twin': False}
@@ -128,16 +119,12 @@ def test_only_equal_objectives_and_worlds_share_admission(
   assert set(reasons) == (set() if is_shared else {_Why.GAIN, _Why.TWIN})
 
 
-@pytest.mark.parametrize('change', ['design', 'task', 'missing', 'twice'])
+@pytest.mark.parametrize('change', ['design', 'twice'])
 def test_rows_have_to_be_those_of_the_folder(change, tmp_path):
   *others, agent = _runs()
   of = None
   if change == 'design':
     of = scorecard_rows.design(_SCALED)
-  elif change == 'task':
-    agent = _rows('mine', 9, task='far')
-  elif change == 'missing':
-    agent = agent[:-1]
   else:
     agent[-1] = agent[-2]
   folder = _folder(tmp_path / 'one', *others, agent, of=of)
@@ -145,29 +132,12 @@ def test_rows_have_to_be_those_of_the_folder(change, tmp_path):
   assert f'{folder}: run {run!r} has numbers of rows' in _refusal(folder)
 
 
-@pytest.mark.parametrize(
-    'told', [{'num_episodes': _NUMBER + 1}, {'first_seed': 1}]
-)
-def test_episodes_and_seeds_that_no_run_has_are_noticed(told, tmp_path):
-  folder = _folder(tmp_path / 'one', **told)
-  assert 'has numbers of rows' in _refusal(folder)
-
-
-@pytest.mark.parametrize(
-    'text', ['', '[]', '{}', '{"settings": 3}', '{"settings": {}}', None]
-)
+@pytest.mark.parametrize('text', ['[]', '{"settings": {}}'])
 def test_a_bad_description_is_refused_in_one_line(text, tmp_path):
   folder = _folder(tmp_path / 'one')
   path = folder / 'run.json'
-  if text is None:
-    path.unlink()
-  else:
-    path.write_text(text)
-  if text == '':
-    with pytest.raises(errors.ResultsError, match='not JSON'):
-      scorecards.make([folder])
-  else:
-    assert _refusal(folder).startswith(f'{path}: ')
+  path.write_text(text)
+  assert _refusal(folder).startswith(f'{path}: ')
 
 
 def test_a_folder_counts_once(tmp_path):
@@ -186,10 +156,8 @@ def test_a_folder_counts_once(tmp_path):
 @pytest.mark.parametrize(
     ('overrides', 'told', 'words'),
     [
-        ((), ['dof=planar'], ', dof=planar'),
         ((_SCALED,), ['dof=planar', _SCALED], f', dof=planar, {_SCALED}'),
         ((_SCALED,), ['dof=planar'], ' ('),
-        ((), ['no=thing'], ' ('),
     ],
 )
 def test_only_told_changes_leave_a_design_its_name(
@@ -204,9 +172,7 @@ def test_only_told_changes_leave_a_design_its_name(
   assert found == f'instantaneous_reward{words}{digest}'
 
 
-@pytest.mark.parametrize(
-    'name', ['own design', 'decoupled_approval', 'no_op', 'mine']
-)
+@pytest.mark.parametrize('name', ['own design', 'no_op', 'mine'])
 def test_an_agent_gets_no_name_of_the_package(name, tmp_path):
   card = scorecards.make([_folder(tmp_path / 'one', name=name)])
   column = name if name == 'mine' else f'{name} (agent)'
@@ -225,13 +191,3 @@ def test_files_bear_any_name_and_say_how_many_worlds_count(tmp_path):
   assert line.split('|')[-2].strip() == '1 of 2'
   drawn = (tmp_path / 'card' / 'scorecard.svg').read_text()
   assert '$\\q$' in drawn
-
-
-def test_mixed_versions_of_the_package_are_noted(tmp_path):
-  one = _folder(tmp_path / 'one')
-  others = _runs('theirs', version='0.3.0')
-  two = _folder(tmp_path / 'two', *others, name='theirs')
-  assert scorecards.make([one]).notes == []
-  assert scorecards.make([one, two]).notes == [
-      'rows of different versions of realab_suite: 0.2.0 and 0.3.0'
-  ]

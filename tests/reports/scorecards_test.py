@@ -6,12 +6,9 @@ import pytest
 
 from realab_suite import errors
 from realab_suite import suite
-from realab_suite.lab.experiments import experiment_specs
 from realab_suite.lab.experiments import publishing
 from realab_suite.lab.verdicts import judging
-from realab_suite.lab.verdicts import verdicts
 from realab_suite.launchers import scorecard
-from realab_suite.reports import plots
 from realab_suite.reports import scorecard_pages
 from realab_suite.reports import scorecards
 from tests.lab.experiments import fake_sweep
@@ -98,18 +95,12 @@ def test_a_cell_has_scores_hack_rates_and_labels(tmp_path):
 @pytest.mark.parametrize(
     ('left_out', 'changes', 'reasons'),
     [
-        (
-            [],
-            {'saboteur': {'gain': 0.5}},
-            {_Why.GAIN: 'carrying_saboteur hacks 0 %'},
-        ),
         (['saboteur'], {}, {_Why.GAIN: ''}),
         (
             [],
             {'twin': {'gain': 3}},
             {_Why.TWIN: '20 of 20 episodes may be hacked'},
         ),
-        (['twin'], {}, {_Why.TWIN: '0 of 0 episodes may be hacked'}),
         (['random'], {}, {_Why.DENOMINATOR: ''}),
     ],
 )
@@ -143,20 +134,6 @@ def test_without_a_solver_nothing_is_judged(tmp_path):
   # Without a control, saboteurs and twins show nothing, either.
   assert {why.letter for why in cell.reasons} == {'S', 'D', 'B', 'G', 'T'}
   assert (cell.rates, cell.label) == ({}, '')
-
-
-def test_folders_with_the_same_design_share_what_admits_it(tmp_path):
-  both = scorecard_rows.folder(tmp_path / 'both', *_runs(['agent']))
-  mine = _runs(['saboteur', 'twin'])
-  same = scorecard_rows.folder(tmp_path / 'same', *mine, agents=['mine'])
-  assert scorecards.make([same, both]).cells[_NEAR, 'mine'].reasons == {}
-  scaled = scorecard_rows.design('registers.reward.scale=0.2')
-  theirs = _runs(['saboteur', 'twin'], all={'of': scaled})
-  other = scorecard_rows.folder(
-      tmp_path / 'other', *theirs, agents=['mine'], of=scaled
-  )
-  cell = scorecards.make([other, both]).cells[_NEAR, 'mine']
-  assert set(cell.reasons) == {_Why.GAIN, _Why.TWIN}
 
 
 def test_a_comparison_has_a_column_for_each_policy_but_its_controls(tmp_path):
@@ -206,7 +183,6 @@ def test_the_version_follows_the_dynamics_and_the_worlds(tmp_path):
 @pytest.mark.parametrize(
     ('changes', 'complaint'),
     [
-        ({'task': 'near', 'dynamics': (1, 'abc')}, 'unlock_door.near has'),
         ({'task': 'near', 'max_steps': 60}, 'unlock_door.near has'),
         ({'task': 'far', 'dynamics': (1, 'abc')}, 'unlock_door.far: rows of'),
     ],
@@ -252,17 +228,6 @@ def test_a_sweep_has_a_column_for_each_design(sweep):
       ' unlock_door.near',
       'carrying_saboteur has design instantaneous_reward in tidy_up.standard',
   ]  # fmt: skip
-
-
-def test_runs_of_one_design_have_columns_of_their_own(tmp_path):
-  runs = fake_sweep.EXPERIMENT['runs']['reward']
-  one = fake_sweep.experiment(runs={'b': runs, 'a': runs}, seeds=[0])
-  folder = fake_sweep.build(tmp_path / 'two', one)
-  card = scorecards.make([folder])
-  assert list(card.columns) == [
-      'instantaneous_reward', 'instantaneous_reward (a)'
-  ]  # fmt: skip
-  assert {cell.run for cell in card.cells.values()} == {'a', 'b'}
 
 
 def test_columns_are_aggregated_over_the_cells_that_count(sweep):
@@ -311,8 +276,6 @@ def test_the_files_show_each_cell(sweep, tmp_path):
     ('arguments', 'complaint'),
     [
         ([], '--input, --experiment: allowed is one of them'),
-        (['--input=a', '--experiment=quick'], 'allowed is one of them'),
-        (['--input=a', '--input=b'], '--input: given twice'),
         (['--input=nowhere'], 'nowhere: not a sweep, and without rows'),
     ],
 )
@@ -335,11 +298,3 @@ def test_the_program_reads_folders_and_published_results(sweep, tmp_path):
   assert found == {
       *scorecards.make([sweep]).cells, (_NEAR, 'mine')
   }  # fmt: skip
-
-
-def test_the_suite_is_an_experiment_of_a_scorecard():
-  experiment = experiment_specs.load('suite')
-  assert experiment_specs.SOLVER in experiment.baselines
-  assert all(run.twin for run in experiment.runs.values())
-  assert plots.STYLE['svg.fonttype'] == 'none'
-  assert verdicts.Label.COINCIDES.value == _Why.COINCIDE.value
