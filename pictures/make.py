@@ -29,7 +29,6 @@ def main() -> None:
     raise errors.ResultsError(f'cannot make pictures: {problem}')
   # These import dm_control, so a renderer has to be chosen first.
   from pictures import carrying
-  from pictures import display
   from pictures import first_person
   from pictures import registers
   from pictures import tampering
@@ -41,8 +40,6 @@ def main() -> None:
   worlds.draw(folder / 'worlds')
   worlds.draw_sheet(folder / 'worlds.png')
   registers.draw(folder / 'registers')
-  # Last, because it adds a kind of register that does not ship.
-  display.draw(folder / 'display.png')
   (folder / 'gallery').mkdir(exist_ok=True)
   if flags.INPUT.value is None:
     program.say('tampering.gif is left out: --input names no sweep')

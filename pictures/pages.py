@@ -76,7 +76,7 @@ def _domain(domain: str) -> str:
   tasks = suite.TASKS_BY_DOMAIN[domain]
   first = tasks[0]
   task = registry.find(domain, first)()
-  row = _figures().get(f'{domain}.{first}', {})
+  row = figures().get(f'{domain}.{first}', {})
   solver = 'none' if task.SOLVER is None else f'`{task.SOLVER}`'
   if task.SOLVER is not None:
     if senses := _listed(policies.make(task.SOLVER).privileged_senses):
@@ -85,9 +85,7 @@ def _domain(domain: str) -> str:
     solver += f'; earns {earned}'
   speed = ''
   if {'single', 'batch'} <= row.keys():
-    # Without the ratios to another world.
-    single, batch = (row[name].split()[0] for name in ('single', 'batch'))
-    speed = f'{single}; {batch} in a batch'
+    speed = f'{row["single"]}; {row["batch"]} in a batch'
   facts = {
       'Tasks': ', '.join(
           f'[`{name}`](images/worlds/{domain}.{name}.png)' for name in tasks
@@ -115,11 +113,11 @@ def _domain(domain: str) -> str:
   return '\n\n'.join([f'### {domain}', picture, *text, '\n'.join(lines)])
 
 
-def _figures() -> dict[str, dict[str, str]]:
-  """Returns the measured figures of each world, by its name."""
+def figures() -> dict[str, dict[str, str]]:
+  """Returns the measured figures of the worlds, by name."""
   if not FIGURES.exists():
     return {}
-  rows: dict[str, dict[str, str]] = json.loads(FIGURES.read_text())['rows']
+  rows: dict[str, dict[str, str]] = json.loads(FIGURES.read_text())
   return rows
 
 

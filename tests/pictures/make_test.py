@@ -7,7 +7,6 @@ from PIL import Image
 import pytest
 
 from pictures import carrying
-from pictures import display
 from pictures import first_person
 from pictures import make
 from pictures import tampering
@@ -26,7 +25,6 @@ _IMAGES = pathlib.Path(__file__).parents[2] / 'docs' / 'images'
 _SIZES = {
     'first_person.png': first_person.SIZE,
     'carrying.png': carrying.SIZE,
-    'display.png': display.SIZE,
     'tampering.gif': tampering.SIZE,
 }
 
@@ -101,7 +99,6 @@ def test_each_picture_is_made_and_shows_its_objects(tmp_path, monkeypatch):
   monkeypatch.setattr(tampering, 'STEPS', 6)
   first_person.draw(tmp_path / 'first_person.png')
   carrying.draw(tmp_path / 'carrying.png')
-  display.draw(tmp_path / 'display.png')
   sweep = _sweep(tmp_path / 'sweep', twin=True)
   tampering.draw(tmp_path / 'tampering.gif', sweep)
   for name, size in _SIZES.items():

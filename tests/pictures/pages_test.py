@@ -127,12 +127,10 @@ def test_a_section_says_what_was_measured(monkeypatch, tmp_path):
   monkeypatch.setattr(pages, 'FIGURES', path)
   assert 'Steps/s' not in pages.worlds()
   rows = {
-      'gates.standard': {
-          'solver': '4 of 5', 'single': '3,210 (0.85)', 'batch': '7 (0.9)',
-      },
+      'gates.standard': {'solver': '4 of 5', 'single': '3,210', 'batch': '7'},
       'tidy_up.standard': {'solver': '1 of 4'},
-  }  # fmt: skip
-  path.write_text(json.dumps({'rows': rows}))
+  }
+  path.write_text(json.dumps(rows))
   text = pages.worlds()
   assert '`gate`); earns 4 of 5\n' in text
   assert '- Steps/s: 3,210; 7 in a batch\n' in text
