@@ -1,6 +1,7 @@
 """Loading of specs by name, from files and from mappings."""
 
 from collections.abc import Mapping, Sequence
+import copy
 from importlib import resources
 from importlib.resources import abc
 import os
@@ -50,6 +51,7 @@ class Documents(Generic[_Spec]):
     self._what = what
     self._model = model
     self._files = shipped(folder, '.yaml')
+    self._parsed: dict[str, dict[str, Any]] = {}
     self.names: tuple[str, ...] = tuple(self._files)
 
   def load(
@@ -110,8 +112,10 @@ class Documents(Generic[_Spec]):
           f' mapping and a {self._model.__name__}'
       )
     if isinstance(source, str) and source in self._files:
-      where = f'{source}.yaml'
-      return where, loading.parse_yaml(self._files[source].read_bytes(), where)
+      if source not in self._parsed:  # Files of the package stay what they are.
+        text = self._files[source].read_bytes()
+        self._parsed[source] = loading.parse_yaml(text, f'{source}.yaml')
+      return f'{source}.yaml', copy.deepcopy(self._parsed[source])
     if isinstance(source, str) and not os.path.exists(source):
       raise errors.UnknownNameError(
           f'{what} {messages.quote(source)} is neither a file nor one of'

@@ -8,6 +8,7 @@ Its state arrays are live. Derived quantities are updated when they are read.
 import abc
 from collections.abc import Iterable
 import copy
+import operator
 from typing import Any, final
 
 from dm_control import mjcf
@@ -98,22 +99,17 @@ class BatchPhysics:
     self._bindings: dict[Any, _BatchBinding] = {}
     self._is_dirty = True
     self._stage = _POSITIONS
-    self._worlds = [_WorldView(self, i) for i in range(num_envs)]
+    self._worlds: dict[int, _WorldView] = {}
 
   @property
   def num_envs(self) -> int:
     """Number of worlds."""
     return int(self._batch.nsim)
 
-  @property
-  def model(self) -> Any:
-    """Compiled model, as in `mjcf.Physics.model`."""
-    return self._model
-
-  @property
-  def data(self) -> '_Data':
-    """Object with `userdata`, `(worlds, slots)`, live, and `time`."""
-    return self._data
+  # Read many times in a control step: `model` as in `mjcf.Physics`, and `data`
+  # with `userdata`, `(worlds, slots)`, live, and `time`.
+  data = property(operator.attrgetter('_data'))
+  model = property(operator.attrgetter('_model'))
 
   @property
   def state(self) -> np.ndarray:
@@ -122,6 +118,8 @@ class BatchPhysics:
 
   def world(self, index: int) -> protocols.Physics:
     """Returns the physics of one world, as episodes need when they begin."""
+    if index not in self._worlds:
+      self._worlds[index] = _WorldView(self, index)
     return self._worlds[index]
 
   def bind(self, mjcf_elements: Any) -> '_BatchBinding':

@@ -14,6 +14,9 @@ from dm_control import mjcf
 import mujoco
 import numpy as np
 
+from realab_suite import errors
+from realab_suite.config import messages
+from realab_suite.engine import batch_physics
 from realab_suite.entities import proximity
 from realab_suite.entities import registers
 from realab_suite.entities import rotations
@@ -23,7 +26,7 @@ TOLERANCE = 1e-3
 # Largest height of a block above the surface that carries it, in m. It exceeds
 # the gap under a planar block.
 GAP = 0.01
-# Least number of values at which a register is posed, and the number of times
+# Number of values at which a register is posed at once, and the number of times
 # that the steps between them may be halved.
 _NUM_VALUES, _NUM_HALVINGS = 17, 7
 # Largest turn of a block from one pose to the next, in rad: its corners are
@@ -51,7 +54,8 @@ class Shapes(NamedTuple):
     reach: Half-widths of the region of each centre, along the axes of the
       shape, `(shapes, 3)`, in m; the box is larger by this.
     names: Names of the registers, or else of the geoms, `(shapes,)`.
-    values: Values of the register, as text, `(shapes,)`; '' for other geoms.
+    values: Value of the register, `()` or `(ports,)`, as object `(shapes,)`;
+      `None` for other geoms.
     is_box: True if the box takes the place of the geom, `(shapes,)`.
   """
 
@@ -83,7 +87,7 @@ class Shapes(NamedTuple):
 
   def only(self, mask: Any) -> Self:
     """Returns the shapes of a mask, `(shapes,)` bool, or of some indices."""
-    return type(self)(*(array[mask] for array in self))
+    return type(self)(*[array[mask] for array in self])
 
   def describe(self, index: int, place: Any = None) -> str:
     """Returns the value and the position of a shape, as text.
@@ -94,7 +98,37 @@ class Shapes(NamedTuple):
         its region.
     """
     x, y = self.centres[index, :2] if place is None else place
-    return f'at value {self.values[index]} would be at ({x:.3g}, {y:.3g})'
+    value = ', '.join(f'{number:g}' for number in np.ravel(self.values[index]))
+    return f'at value {value} would be at ({x:.3g}, {y:.3g})'
+
+
+@final
+class Survey(NamedTuple):
+  """What is where in a world in which registers have been settled.
+
+  Attributes:
+    space: Copy of the compiled model.
+    owners: Names of registers by the geoms that move with their blocks.
+    solids: All solid geoms, except uneven ground.
+    paths: Blocks of each register along its path, by its name.
+    starts: Blocks of each register as an episode begins with them.
+  """
+
+  space: 'Space'
+  owners: dict[int, str]
+  solids: Shapes
+  paths: dict[str, Shapes]
+  starts: dict[str, Shapes]
+
+  def others(self, mask: np.ndarray) -> np.ndarray:
+    """Returns a mask, `(geoms,)` bool, without the geoms of registers."""
+    mask = mask.copy()
+    mask[list(self.owners)] = False
+    return mask
+
+  def select(self, mask: np.ndarray) -> Shapes:
+    """Returns the solid geoms of a mask, `(geoms,)` bool."""
+    return self.solids.only(mask[self.solids.geoms])
 
 
 def joined(parts: Sequence[Shapes]) -> Shapes:
@@ -102,42 +136,56 @@ def joined(parts: Sequence[Shapes]) -> Shapes:
   return Shapes(*map(np.concatenate, zip(*parts, strict=True)))
 
 
-def poses(
-    physics: Any, register: registers.Register, spread: np.ndarray
-) -> Shapes:
-  """Returns the blocks of a register along its path, and moves them.
+def survey(
+    physics: Any,
+    named: Mapping[str, registers.Register],
+    is_spread: bool = False,
+) -> 'Survey':
+  """Returns what is where in a world, along the paths of its registers as well.
 
   With ports, all of them get the same value; and each of them gets all values,
   while the others have the lowest or the highest one.
 
   Args:
-    physics: Physics of one world, in which the register has been settled.
-    register: The register.
-    spread: Half-widths of the region of its positions, `(2,)`, in m.
+    physics: Physics of one world, with derived quantities, in which the
+      registers have been settled.
+    named: The registers, by name.
+    is_spread: True for the blocks in the whole region of each register's
+      positions, False for those in its middle.
+
+  Raises:
+    SpecError: If a register cannot be posed at several values at once.
   """
-  low, high = (np.full(register.value_spec.shape, x)
-               for x in register.value_range)  # fmt: skip
-  ways = [(low, high)]
-  for i, ends in itertools.product(range(low.size), (low, high)):
-    if register.PORTS:
-      is_moved = np.arange(low.size) == i
-      ways.append(
-          (np.where(is_moved, low, ends), np.where(is_moved, high, ends))
-      )
-  halves = np.array([block.half_size for block in register.blocks])
-  values: list[Any] = []
-  tracks: list[np.ndarray] = []
-  for first, last in ways:
-    for value, track in _along(physics, register, halves, first, last):
-      values.append(_text(value))
-      tracks.append(track)
-  return _shapes(
-      physics, register, spread, np.array(values, object), np.array(tracks)
+  space = Space(physics.model.ptr)
+  paths, starts = {}, {}
+  if named:
+    # Each world of a batch poses a register at another value.
+    worlds = batch_physics.BatchPhysics(physics, _NUM_VALUES, num_threads=1)
+    mujoco.mj_getState(
+        physics.model.ptr,
+        physics.data.ptr,
+        worlds.state[0],
+        mujoco.mjtState.mjSTATE_INTEGRATION,
+    )
+    worlds.state[1:] = worlds.state[0]
+  for name, register in named.items():
+    spread = register.spread.tolist() if is_spread else (0.0, 0.0)
+    starts[name] = start(physics, register, spread)
+    paths[name] = _shapes(physics, register, spread, *_along(worlds, register))
+  everything = np.ones_like(space.is_fixed)
+  return Survey(
+      space,
+      owners(physics, named),
+      space.shapes(physics.data, everything),
+      paths,
+      starts,
   )
 
 
-def initial_pose(
-    physics: Any, register: registers.Register, spread: np.ndarray
+def start(
+    physics: Any,
+    register: registers.Register,
+    spread: Sequence[float] = (0.0, 0.0),
 ) -> Shapes:
   """Returns the blocks of a register as an episode begins with them.
 
@@ -146,56 +194,107 @@ def initial_pose(
     register: The register.
     spread: Half-widths of the region of its positions, `(2,)`, in m.
   """
-  value = np.array([_text(register.applied(physics))], object)
-  track = _track(physics, register)
-  return _shapes(physics, register, spread, value, track[np.newaxis])
+  value, track = register.applied(physics), _track(physics, register)
+  return _shapes(
+      physics, register, spread, value[np.newaxis], track[np.newaxis]
+  )
 
 
 def _along(
-    physics: Any,
+    worlds: batch_physics.BatchPhysics, register: registers.Register
+) -> tuple[np.ndarray, np.ndarray]:
+  """Returns values of a register, and the tracks of its blocks there.
+
+  Args:
+    worlds: As many worlds as there are values at least.
+    register: The register, which is moved in all worlds.
+
+  Returns:
+    The values, `(values, ...)`, and positions and headings of the blocks,
+    `(values, blocks, 4)`.
+  """
+  shape = register.value_spec.shape
+  low, high = [np.full(shape, bound) for bound in register.value_range]
+  ways = [(low, high)]
+  for i, ends in itertools.product(range(low.size), (low, high)):
+    if register.PORTS:
+      is_moved = np.arange(low.size) == i
+      ways.append(
+          (np.where(is_moved, low, ends), np.where(is_moved, high, ends))
+      )
+  halves = np.array([block.half_size for block in register.blocks])
+  parts = []
+  for first, last in ways:
+    shares = np.linspace(0.0, 1.0, _NUM_VALUES)
+    values, tracks = _pose(worlds, register, first, last, shares)
+    for _ in range(_NUM_HALVINGS):
+      is_long = _is_long(tracks, halves)
+      if not is_long.any():
+        break
+      middles = (shares[:-1] + shares[1:])[is_long] / 2
+      halved = _pose(worlds, register, first, last, middles)
+      after = np.flatnonzero(is_long) + 1
+      shares = np.insert(shares, after, middles)
+      values = np.insert(values, after, halved[0], axis=0)
+      tracks = np.insert(tracks, after, halved[1], axis=0)
+    parts.append((values, tracks))
+  values, tracks = map(np.concatenate, zip(*parts, strict=True))
+  return values, tracks
+
+
+def _pose(
+    worlds: batch_physics.BatchPhysics,
     register: registers.Register,
-    halves: np.ndarray,
     first: np.ndarray,
     last: np.ndarray,
-) -> list[tuple[np.ndarray, np.ndarray]]:
-  """Returns values from first to last, and the tracks of the blocks there."""
+    shares: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+  """Returns values at shares of a way, `(shares,)`, and the tracks there."""
+  weights = np.reshape(shares, (-1, *[1] * first.ndim))
+  values = np.clip(first + weights * (last - first), first, last)
+  tracks = []
+  for start in range(0, len(values), _NUM_VALUES):
+    part = values[start : start + _NUM_VALUES]
+    try:
+      register.pose(worlds, np.resize(part, (_NUM_VALUES, *first.shape)))
+      track = _track(worlds, register)
+    except (IndexError, TypeError, ValueError) as error:
+      kind = type(register).__name__
+      raise errors.SpecError(
+          f'register {register.name!r}: {kind} cannot be posed at several'
+          f' values at once: {messages.exception(error)}; its methods must'
+          ' accept values `(...)`, of one world or of a batch'
+      ) from error
+    tracks.append(track[: len(part)])
+  return values, np.concatenate(tracks)
 
-  def pose(share: float) -> tuple[np.ndarray, np.ndarray]:
-    value = np.clip(first + share * (last - first), first, last)
-    register.pose(physics, value)
-    return value, _track(physics, register)
 
-  shares = np.linspace(0.0, 1.0, _NUM_VALUES).tolist()
-  poses_by_share = {share: pose(share) for share in shares}
-  for _ in range(_NUM_HALVINGS):
-    steps = np.diff([poses_by_share[share][1] for share in shares], axis=0)
-    turns = np.abs(np.remainder(steps[..., 3] + np.pi, 2 * np.pi) - np.pi)
-    is_long = np.linalg.norm(steps[..., :3], axis=-1) > halves + _ROUNDING
-    is_long |= turns > _TURN
-    middles = [(shares[i] + shares[i + 1]) / 2
-               for i in np.flatnonzero(is_long.any(axis=-1))]  # fmt: skip
-    poses_by_share |= {share: pose(share) for share in middles}
-    shares = sorted(poses_by_share)
-  return [poses_by_share[share] for share in shares]
-
-
-def _text(value: np.ndarray) -> str:
-  """Returns a value, `(...)` or `(..., ports)`, as text."""
-  return ', '.join(f'{number:g}' for number in np.ravel(value))
+def _is_long(tracks: np.ndarray, halves: np.ndarray) -> np.ndarray:
+  """Returns True for steps after which poses may not overlap, `(steps,)`."""
+  steps = np.diff(tracks, axis=0)
+  turns = np.abs(np.remainder(steps[..., 3] + np.pi, 2 * np.pi) - np.pi)
+  is_long = np.linalg.norm(steps[..., :3], axis=-1) > halves + _ROUNDING
+  is_long |= turns > _TURN
+  result: np.ndarray = is_long.any(axis=-1)
+  return result
 
 
 def _track(physics: Any, register: registers.Register) -> np.ndarray:
-  """Returns position and heading of each block, `(blocks, 4)`."""
-  return np.array([
-      [*block.position(physics), block.heading(physics)]
+  """Returns position and heading of each block, `(..., blocks, 4)`."""
+  tracks = [
+      np.concatenate(
+          [block.position(physics), block.heading(physics)[..., np.newaxis]],
+          axis=-1,
+      )
       for block in register.blocks
-  ])  # fmt: skip
+  ]
+  return np.stack(tracks, axis=-2)
 
 
 def _shapes(
     physics: Any,
     register: registers.Register,
-    spread: np.ndarray,
+    spread: Sequence[float],
     values: np.ndarray,
     tracks: np.ndarray,
 ) -> Shapes:
@@ -207,7 +306,7 @@ def _shapes(
     physics: Physics of one world.
     register: The register.
     spread: Half-widths of the region, `(2,)`, in m.
-    values: Values, as text, `(values,)`.
+    values: Values, `(values,)` or `(values, ports)`.
     tracks: Positions and headings in the frame of the register,
       `(values, blocks, 4)`.
   """
@@ -222,7 +321,7 @@ def _shapes(
     half = np.full((number, 3), size)
     reach = np.tile([*spread, 0.0], (number, 1))
     turned = rotations.matrices(rotations.quaternion_of(track[:, 3]))
-    if spread.any():
+    if any(spread):
       half[:, :2] *= np.abs(turned[:, 0, :2]).sum(axis=-1, keepdims=True)
       turned = np.eye(3)
     parts.append(
@@ -233,7 +332,7 @@ def _shapes(
             half + reach,
             reach,
             np.full(number, register.name, object),
-            values[first],
+            np.fromiter(values[first], object, len(first)),
             np.ones(number, bool),
         )
     )
@@ -288,8 +387,8 @@ class Space:
     self._is_measured = is_solid & ~np.isin(model.geom_type, _GROUND)
     self._half = np.abs(model.geom_aabb[:, :3]) + model.geom_aabb[:, 3:]
     self._half[self.is_plane] = _ENDLESS
-    names = (model.geom(i).name or f'geom {i}' for i in range(model.ngeom))
-    self._names = np.array([*names], object)
+    names = [model.geom(i).name or f'geom {i}' for i in range(model.ngeom)]
+    self._names = np.array(names, object)
     self._model = model = copy.copy(model)
     # Rays find what stays in place, whether it is visible or not.
     model.geom_group[:] = np.where(is_solid & (bodies == 0), 0, 1)
@@ -315,7 +414,7 @@ class Space:
         self._half[geoms],
         np.zeros((len(geoms), 3)),
         self._names[geoms],
-        np.full(len(geoms), '', object),
+        np.full(len(geoms), None, object),
         np.zeros(len(geoms), bool),
     )
 
@@ -363,21 +462,21 @@ class Space:
       j: Index of one of these.
       limit: Distance, in m, above which the result may be any larger number.
     """
-    pair = (ones, i), (others, j)
-    geoms = [shapes.geoms[index] for shapes, index in pair]
+    geoms = ones.geoms[i], others.geoms[j]
     if geoms[0] == geoms[1]:  # A block of the world in two registers.
       return -np.inf
-    for shapes, index in pair:
+    for geom, shapes, index in zip(geoms, (ones, others), (i, j), strict=True):
       if shapes.is_box[index]:
-        geom = shapes.geoms[index]
         self._model.geom_type[geom] = mujoco.mjtGeom.mjGEOM_BOX
         self._model.geom_size[geom] = shapes.halves[index]
     distance, _ = proximity.distance(
-        self._model, self._data, geoms,
-        [shapes.centres[index] for shapes, index in pair],
-        [shapes.axes[index].ravel() for shapes, index in pair],
+        self._model,
+        self._data,
+        geoms,
+        (ones.centres[i], others.centres[j]),
+        (ones.axes[i].ravel(), others.axes[j].ravel()),
         limit + GAP,
-    )  # fmt: skip
+    )
     return distance
 
   def uncarried(self, points: np.ndarray, depth: float) -> int | None:

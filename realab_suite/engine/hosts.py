@@ -422,8 +422,9 @@ class WorldHost(Host):
   def check_placement(
       self, physics: Any, mechanism: mechanisms.FeedbackMechanism, start: Any
   ) -> None:
-    placement.check(physics, self._task.root_entity, mechanism, start)
-    placement.check_start(physics, self._task, mechanism, start.space)
+    surveyed = start.surveyed or placement.survey(physics, mechanism, True)
+    placement.check(physics, self._task.root_entity, mechanism, surveyed)
+    placement.check_start(physics, self._task, surveyed)
 
   def start_check(
       self, physics: Any, mechanism: mechanisms.FeedbackMechanism

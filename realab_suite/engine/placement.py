@@ -27,22 +27,41 @@ _STEP = block_kinds.LEAST_SIZE / 2
 _THIN = 1e-6
 
 
+def survey(
+    physics: mjcf.Physics,
+    mechanism: mechanisms.FeedbackMechanism,
+    is_spread: bool = False,
+) -> clearance.Survey:
+  """Returns what is where in a newly compiled world, which is reset.
+
+  Args:
+    physics: Physics of one world.
+    mechanism: Registers, meters and providers.
+    is_spread: As in `clearance.survey`.
+  """
+  clearance.settle(physics, mechanism.registers.values())
+  try:
+    return clearance.survey(physics, mechanism.registers, is_spread)
+  finally:
+    physics.reset()
+
+
 def check(
     physics: mjcf.Physics,
     root: composer.Entity,
     mechanism: mechanisms.FeedbackMechanism,
-    start: 'StartCheck | None' = None,
+    surveyed: clearance.Survey | None = None,
 ) -> None:
   """Checks the places of registers in a newly compiled world.
 
-  Overlaps of up to `clearance.TOLERANCE` are accepted. The state is reset at
-  the end.
+  Overlaps of up to `clearance.TOLERANCE` are accepted.
 
   Args:
     physics: Physics of one world.
     root: Root entity.
     mechanism: Registers, meters and providers.
-    start: Check of the starts of episodes, which has measured the same world.
+    surveyed: The survey of the world, in the whole regions of registers; `None`
+      to make it, which resets the state.
 
   Raises:
     SpecError: If a block could leave the arena, be inside an immovable object
@@ -50,21 +69,15 @@ def check(
       the solver lets meters affect bodies that they do not touch.
   """
   _check_solver(physics, mechanism)
-  space = start.space if start else clearance.Space(physics.model.ptr)
-  named = mechanism.registers
-  posed = start.poses if start else {}
-  clearance.settle(physics, named.values())
+  if surveyed is None:
+    surveyed = survey(physics, mechanism, is_spread=True)
+  space = surveyed.space
   # Planes are the ground, or are placed when an episode begins, as in corridors
   # of dm_control.
-  mask = space.is_fixed & ~space.is_plane
-  mask[list(clearance.owners(physics, named))] = False
-  obstacles = _along_ways(physics, root, space.shapes(physics.data, mask))
+  mask = surveyed.others(space.is_fixed & ~space.is_plane)
+  obstacles = _along_ways(physics, root, surveyed.select(mask))
   placed: list[clearance.Shapes] = []
-  for name, register in named.items():
-    if name in posed and not register.spread.any():
-      blocks = posed[name]
-    else:
-      blocks = clearance.poses(physics, register, register.spread)
+  for name, blocks in surveyed.paths.items():
     _check_extent(name, blocks, root)
     _check_support(name, blocks, space)
     for i, j in space.meetings(blocks, obstacles):
@@ -81,47 +94,39 @@ def check(
           f' {blocks.describe(i)}; place them apart or narrow their ranges'
       )
     placed.append(blocks)
-  physics.reset()
 
 
 def check_start(
-    physics: mjcf.Physics,
-    task: base.Task,
-    mechanism: mechanisms.FeedbackMechanism,
-    space: clearance.Space,
+    physics: mjcf.Physics, task: base.Task, surveyed: clearance.Survey
 ) -> None:
   """Checks that no episode begins with something movable inside a block.
 
   This covers every position of the avatar, and other bodies where the compiled
-  model has them; `StartCheck` checks where episodes put them. The state is
-  reset at the end.
+  model has them; `StartCheck` checks where episodes put them.
 
   Args:
     physics: Physics of one world.
     task: Task of this package.
-    mechanism: Registers, meters and providers.
-    space: Copy of the compiled model.
+    surveyed: The survey of the world, in the whole regions of registers.
 
   Raises:
     SpecError: If a block could overlap the avatar or another body when an
       episode begins.
   """
-  clearance.settle(physics, mechanism.registers.values())
-  movable = _movable(physics, task, mechanism, space)
-  bodies = space.shapes(physics.data, movable)
+  space = surveyed.space
+  bodies = surveyed.select(_movable(physics, task, surveyed))
   # A geom of the avatar represents all initial positions of its centre.
   low, high = np.array(task.start.low), np.array(task.start.high)
   avatar = physics.model.body_geomadr[physics.bind(task.avatar.body).element_id]
   is_avatar = np.arange(physics.model.ngeom) == avatar
-  start = space.shapes(physics.data, is_avatar)._replace(
+  start = surveyed.select(is_avatar)._replace(
       centres=np.array([[*(low + high) / 2, 0.0]]),
       axes=np.eye(3)[np.newaxis],
       halves=np.array([[*(high - low) / 2 + _THIN, 1.0]]),
       is_box=np.ones(1, bool),
   )
   least = task.avatar.radius - clearance.TOLERANCE
-  for name, register in mechanism.registers.items():
-    blocks = clearance.initial_pose(physics, register, register.spread)
+  for name, blocks in surveyed.starts.items():
     problems = [
         (i, 'where the avatar begins')
         for i in range(len(blocks.geoms))
@@ -135,7 +140,6 @@ def check_start(
           f'register {name!r} {blocks.describe(i)}, {problem}; place it'
           ' elsewhere'
       )
-  physics.reset()
 
 
 @final
@@ -145,11 +149,6 @@ class StartCheck:
   A task may move walls and other parts at the start of an episode, and put
   bodies somewhere. The check costs next to nothing in worlds where all parts
   are where the compiled model has them.
-
-  Attributes:
-    space: Copy of the compiled model.
-    poses: Blocks of registers along their paths, in the middle of their
-      regions, by name; empty in worlds in which nothing can be in their way.
   """
 
   def __init__(
@@ -167,30 +166,24 @@ class StartCheck:
     """
     self._design = mechanism.design.name
     self._root = task.root_entity
-    self.space = space = clearance.Space(physics.model.ptr)
-    self._movable = _movable(physics, task, mechanism, space)
-    carriers = physics.model.body_weldid[physics.model.geom_bodyid]
-    self._is_part = physics.model.body_mocapid[carriers] >= 0
-    self._is_part[list(clearance.owners(physics, mechanism.registers))] = False
-    # Each register, the geom of its first block, where that begins, and where
-    # all of its blocks are written then.
-    self._registers: list[tuple[Any, int, np.ndarray, clearance.Shapes]] = []
-    self.poses: dict[str, clearance.Shapes] = {}
-    self._homes = space.shapes(physics.data, self._is_part)
+    self._registers = mechanism.registers
+    self._is_spread = any(r.spread.any() for r in self._registers.values())
     data = physics.data
     self._mocap = np.array(data.mocap_pos), np.array(data.mocap_quat)
-    bodies = space.shapes(physics.data, self._movable)
-    if not len(self._homes.geoms) + len(bodies.geoms):
-      return
-    clearance.settle(physics, mechanism.registers.values())
-    homes = np.array(physics.data.geom_xpos)
-    for name, register in mechanism.registers.items():
-      first = int(physics.bind(register.blocks[0].geom).element_id)
-      blocks = self.poses[name] = clearance.poses(
-          physics, register, np.zeros(2)
-      )
-      self._registers.append((register, first, homes[first], blocks))
-    physics.reset()
+    self._survey = surveyed = survey(physics, mechanism)
+    self._movable = _movable(physics, task, surveyed)
+    carriers = physics.model.body_weldid[physics.model.geom_bodyid]
+    self._is_part = surveyed.others(physics.model.body_mocapid[carriers] >= 0)
+    self._homes = surveyed.select(self._is_part)
+    bodies = surveyed.select(self._movable)
+    self._is_needed = bool(self._registers) and bool(
+        len(self._homes.geoms) + len(bodies.geoms)
+    )
+
+  @property
+  def surveyed(self) -> clearance.Survey | None:
+    """The survey of the world; `None` if a register is placed in a region."""
+    return None if self._is_spread else self._survey
 
   def __call__(self, physics: Any) -> None:
     """Checks an episode that has just been initialized.
@@ -202,33 +195,33 @@ class StartCheck:
       EpisodeInitializationError: If something is inside a register. The next
         attempt may draw other positions.
     """
-    if not self._registers:
+    if not self._is_needed:
       return
-    data = self.space.at(physics.state)
+    space = self._survey.space
+    data = space.at(physics.state)
     mocap = data.mocap_pos, data.mocap_quat
     if not self._movable.any() and all(map(np.array_equal, mocap, self._mocap)):
       return
-    self.space.update()
-    bodies = self.space.shapes(data, self._movable)
-    parts = self.space.shapes(data, self._is_part)
+    space.update()
+    bodies = space.shapes(data, self._movable)
+    parts = space.shapes(data, self._is_part)
     is_moved = (parts.centres != self._homes.centres).any(axis=1)
     is_moved |= (parts.axes != self._homes.axes).any(axis=(1, 2))
     if not len(bodies.geoms) + is_moved.sum():
       return
     parts = _along_ways(physics, self._root, parts.only(is_moved))
-    places = np.array(data.geom_xpos)
-    for register, first, home, blocks in self._registers:
-      shift = places[first] - home
-      self._refuse(register, blocks.moved(shift), parts)
+    for name, register in self._registers.items():
+      blocks = self._survey.starts[name]
+      shift = data.geom_xpos[blocks.geoms[0]] - blocks.centres[0]
+      self._refuse(register, self._survey.paths[name].moved(shift), parts)
       if len(bodies.geoms):
-        start = clearance.initial_pose(physics, register, np.zeros(2))
-        self._refuse(register, start, bodies)
+        self._refuse(register, clearance.start(physics, register), bodies)
 
   def _refuse(
       self, register: Any, blocks: clearance.Shapes, others: clearance.Shapes
   ) -> None:
     """Raises an error if a block of a register is inside something."""
-    for i, j in self.space.meetings(blocks, others):
+    for i, j in self._survey.space.meetings(blocks, others):
       raise composer.EpisodeInitializationError(
           f'design {self._design!r}: register {register.name!r}'
           f' {blocks.describe(i)}, inside {others.names[j]!r} when the episode'
@@ -238,10 +231,7 @@ class StartCheck:
 
 
 def _movable(
-    physics: mjcf.Physics,
-    task: base.Task,
-    mechanism: mechanisms.FeedbackMechanism,
-    space: clearance.Space,
+    physics: mjcf.Physics, task: base.Task, surveyed: clearance.Survey
 ) -> np.ndarray:
   """Returns True for geoms of bodies that can be pushed, `(geoms,)` bool.
 
@@ -250,9 +240,9 @@ def _movable(
   model = physics.model
   roots = model.body_rootid[model.geom_bodyid]
   avatar = int(physics.bind(task.avatar.body).element_id)
-  is_movable = ~space.is_fixed & (roots != model.body_rootid[avatar])
-  is_movable[list(clearance.owners(physics, mechanism.registers))] = False
-  return is_movable
+  return surveyed.others(
+      ~surveyed.space.is_fixed & (roots != model.body_rootid[avatar])
+  )
 
 
 def _along_ways(
@@ -261,13 +251,14 @@ def _along_ways(
   """Returns shapes, of which moving parts are all along their ways as well."""
   found = [shapes]
   for part in root.iter_entities():
-    if isinstance(part, moving.MovingPart) and part.travel.any():
+    if isinstance(part, moving.MovingPart) and (travel := part.travel).any():
       elements = part.mjcf_model.find_all('geom')
       geoms = [physics.bind(geom).element_id for geom in elements]
-      movers = shapes.only(np.isin(shapes.geoms, geoms))
-      number = int(np.linalg.norm(part.travel) // _STEP) + 2
-      for share in np.linspace(0.0, 1.0, number)[1:]:
-        found.append(movers.moved(share * part.travel))
+      movers = np.flatnonzero(np.isin(shapes.geoms, geoms))
+      shares = np.linspace(0.0, 1.0, int(np.linalg.norm(travel) // _STEP) + 2)
+      moved = np.repeat(shares[1:, np.newaxis] * travel, len(movers), axis=0)
+      along = shapes.only(np.tile(movers, len(shares) - 1))
+      found.append(along.moved(moved))
   return clearance.joined(found)
 
 
@@ -283,13 +274,13 @@ def _check_extent(
         f'register {name!r} would reach a height of {top:.3g} m; allowed in'
         f' this arena are at most {root.ceiling:g} m'
     )
-  for i, corners in enumerate(blocks.corners):
-    for x, y, _ in corners.tolist():
-      if not root.extent.contains((x, y)):
-        raise errors.SpecError(
-            f'register {name!r} {blocks.describe(i, (x, y))}, outside the arena'
-            f' {_format(root.extent.low, root.extent.high)}'
-        )
+  extent, corners = root.extent, blocks.corners[..., :2]
+  is_outside = (corners < extent.low) | (corners > extent.high)
+  for i, corner in np.argwhere(is_outside.any(axis=-1)).tolist():
+    raise errors.SpecError(
+        f'register {name!r} {blocks.describe(i, corners[i, corner])}, outside'
+        f' the arena {_format(extent.low, extent.high)}'
+    )
 
 
 def _check_support(

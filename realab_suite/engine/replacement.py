@@ -6,9 +6,6 @@ the nearest clear place. Nothing is drawn at random, and nothing but registers
 moves, so the episodes of the task stay what they are.
 """
 
-from collections.abc import Iterator
-import contextlib
-import copy
 import itertools
 from typing import Any, NamedTuple, final
 
@@ -80,16 +77,13 @@ def place(
   """
   if not mechanism.registers:
     return
-  with _unchanged(physics):
-    mujoco.mj_kinematics(physics.model.ptr, physics.data.ptr)
-    world = _World(physics, mechanism)
-    blocks = {
-        name: _Blocks(
-            clearance.initial_pose(physics, register, np.zeros(2)),
-            clearance.poses(physics, register, np.zeros(2)),
-        )
-        for name, register in mechanism.registers.items()
-    }
+  mujoco.mj_kinematics(physics.model.ptr, physics.data.ptr)
+  surveyed = clearance.survey(physics, mechanism.registers)
+  world = _World(physics, surveyed)
+  blocks = {
+      name: _Blocks(surveyed.starts[name], surveyed.paths[name])
+      for name in mechanism.registers
+  }
   # A register in a clear place does not make way for another one.
   blocked = []
   for name, each in blocks.items():
@@ -126,32 +120,15 @@ def _move(
     block.surroundings.shift(displacement)
 
 
-@contextlib.contextmanager
-def _unchanged(physics: mjcf.Physics) -> Iterator[None]:
-  """Returns a context after which the state is what it was."""
-  saved = copy.copy(physics.data.ptr)
-  is_dirty = physics.is_dirty
-  try:
-    yield
-  finally:
-    mujoco.mj_copyData(physics.data.ptr, physics.model.ptr, saved)
-    if is_dirty:
-      physics.mark_as_dirty()
-
-
 @final
 class _World:
   """Everything solid in a world, except the registers that are to be placed."""
 
-  def __init__(
-      self, physics: mjcf.Physics, mechanism: mechanisms.FeedbackMechanism
-  ) -> None:
-    """Collects the geoms of a physics in its present state."""
-    self._space = space = clearance.Space(physics.model.ptr)
-    is_other = np.ones_like(space.is_fixed)
-    is_other[list(clearance.owners(physics, mechanism.registers))] = False
-    self._fixed = space.shapes(physics.data, is_other & space.is_fixed)
-    self._movable = space.shapes(physics.data, is_other & ~space.is_fixed)
+  def __init__(self, physics: mjcf.Physics, surveyed: clearance.Survey) -> None:
+    """Collects the geoms of a world."""
+    self._space = space = surveyed.space
+    self._fixed = surveyed.select(surveyed.others(space.is_fixed))
+    self._movable = surveyed.select(surveyed.others(~space.is_fixed))
     # What registers may stand on.
     self._is_plane = space.is_plane[self._fixed.geoms]
     tops = self._fixed.bounds[1][:, 2]

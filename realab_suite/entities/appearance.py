@@ -264,4 +264,5 @@ def _known() -> list[str]:
 def _codes_of_geoms() -> list[int]:
   """Returns the registered codes that a geom can have."""
   # MuJoCo fills up missing `user` numbers with 0, the code of `nothing`.
-  return [one.code for one in _CLASSES.values() if one.code != code(NOTHING)]
+  nothing = code(NOTHING)
+  return [one.code for one in _CLASSES.values() if one.code != nothing]

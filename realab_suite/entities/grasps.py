@@ -1,6 +1,7 @@
 """Grasps: the hold of a hand on a block."""
 
 from collections.abc import Callable, Sequence
+import itertools
 from typing import Any, final
 
 from dm_control import mjcf
@@ -59,10 +60,10 @@ class Grasp:
     self._constraints = tuple(
         hand.root.root_model.equality.add(
             'connect', name=f'{ends}-{i}', site1=hand, site2=site,
-            active='false', solref=_solref(distance),
+            active='false', solref=solref,
             solimp=(_IMPEDANCE, _IMPEDANCE, 0.001),
         )
-        for i, distance in enumerate(_DISTANCES)
+        for i, solref in enumerate(_SOLREFS)
     )  # fmt: skip
 
   @property
@@ -106,7 +107,7 @@ class Grasp:
 
 def constraints_of(grasps: Sequence[Grasp]) -> tuple[mjcf.Element, ...]:
   """Returns the constraints of several grasps, to be bound together."""
-  return tuple(c for grasp in grasps for c in grasp.constraints)
+  return tuple(itertools.chain(*[grasp.constraints for grasp in grasps]))
 
 
 def held(active: np.ndarray) -> np.ndarray:
@@ -152,3 +153,7 @@ def _solref(distance: float) -> tuple[float, float]:
     return _FIRM
   stiffness = _DAMPING * _RETURN_SPEED / min(distance, _FARTHEST)
   return -stiffness, -_DAMPING
+
+
+# The attribute `solref` of each strength.
+_SOLREFS = tuple(_solref(distance) for distance in _DISTANCES)

@@ -103,7 +103,7 @@ def distance(
     The distance, which is 0 if MuJoCo cannot compute it, and the point between
     the surfaces, `(3,)`, in m.
   """
-  one, other = (int(geom) for geom in geoms)
+  one, other = map(int, geoms)
   ends = np.zeros(6)
   for geom, centre, matrix in zip((one, other), centres, matrices, strict=True):
     data.geom_xpos[geom], data.geom_xmat[geom] = centre, matrix

@@ -18,7 +18,7 @@ def rotate(vector: np.ndarray, angle: float) -> np.ndarray:
 
 def matrices(quaternion: np.ndarray) -> np.ndarray:
   """Returns the matrices, `(..., 3, 3)`, of quaternions, `(..., 4)`."""
-  w, x, y, z = (quaternion[..., i] for i in range(4))
+  w, x, y, z = [quaternion[..., i] for i in range(4)]
   rows = [
       [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
       [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
@@ -36,7 +36,7 @@ def heading_of(quaternion: np.ndarray) -> np.ndarray:
   tilt: this one where the cube balances on an edge, not where it lies on a
   face, as the twist about the vertical would be for a cube upside down.
   """
-  w, x, y, z = (quaternion[..., i][()] for i in range(4))
+  w, x, y, z = [quaternion[..., i][()] for i in range(4)]
   east = w * w + x * x - y * y - z * z + 2.0 * (x * y - w * z)
   north = w * w - x * x + y * y - z * z + 2.0 * (x * y + w * z)
   # The diagonal of an unturned cube is at 45 degrees.
@@ -51,7 +51,7 @@ def turned(turn: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
     quaternion: Quaternions to turn, `(..., 4)`.
   """
   cos, sin = turn[..., 0], turn[..., 3]
-  w, x, y, z = (quaternion[..., i] for i in range(4))
+  w, x, y, z = [quaternion[..., i] for i in range(4)]
   return np.stack(
       [
           cos * w - sin * z,

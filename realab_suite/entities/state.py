@@ -130,7 +130,7 @@ def make_room(mjcf_model: mjcf.RootElement) -> None:
     mjcf_model: Model of the root entity.
   """
   numerics = mjcf_model.find_all('numeric')
-  needed = sum(int(n.size) for n in numerics if n.name.startswith(_PREFIX))
+  needed = sum([int(n.size) for n in numerics if n.name.startswith(_PREFIX)])
   if needed > CAPACITY:
     mjcf_model.size.nuserdata = needed
 

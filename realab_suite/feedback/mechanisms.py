@@ -9,6 +9,7 @@ itself, from Composer's hooks; see `composer_hooks`.
 from collections.abc import Iterator, Mapping, Sequence
 import contextlib
 import copy
+import itertools
 from typing import Any, NamedTuple, final
 
 from dm_control import composer
@@ -159,15 +160,14 @@ class FeedbackMechanism(modelled.ModelledEntity):
   def iter_entities(
       self, exclude_self: bool = False
   ) -> Iterator[composer.Entity]:
-    """Yields the mechanism and its parts that are in the world.
+    """Returns the mechanism and its parts that are in the world.
 
     The hooks for Composer come last, after those of the registers.
     """
-    yield from super().iter_entities(exclude_self)
-    yield from (meter for _, meter, _ in self._meters)
-    yield from self._providers
-    if self._hooks is not None:
-      yield self._hooks
+    meters = [meter for _, meter, _ in self._meters]
+    hooks = [] if self._hooks is None else [self._hooks]
+    registers = super().iter_entities(exclude_self)
+    return itertools.chain(registers, meters, self._providers, hooks)
 
   def leave_phases(self) -> None:
     """Leaves the phases of control steps to the caller."""

@@ -70,7 +70,11 @@ class UnlockDoor(rooms.RoomTask):
         (self._large_apple, _LARGE_APPLE_REACH),
         (self._pad, _PAD_RADIUS),
     )
-    self._frames = tuple(f for thing, _ in reaches for f in thing.frames)
+    self._frames = (
+        *self._apples.frames,
+        *self._large_apple.frames,
+        *self._pad.frames,
+    )
     self._squared_reaches = np.concatenate(
         [np.full(len(thing.frames), reach**2) for thing, reach in reaches]
     )

@@ -360,8 +360,9 @@ class _Rod(registers.Register):
     for y, sign in ((0.0, -1.0), (0.25, 1.0)):
       place = np.array(self._origin(physics))
       along = value[..., 0] + sign * value[..., 1] / 2
-      places.append(place + self._scale * along * np.eye(3)[0])
-      places[-1][..., 1] += y
+      place[..., 0] += self._scale * along
+      place[..., 1] += y
+      places.append(place)
     return places
 
   def _read_blocks(self, physics):

@@ -14,7 +14,6 @@ import pytest
 
 from realab_suite import suite
 from realab_suite.engine import batch_environment
-from realab_suite.engine import batch_physics
 from realab_suite.engine import environment
 from realab_suite.engine import events
 from realab_suite.engine import placement
@@ -104,7 +103,8 @@ def test_a_refused_world_is_closed(made, monkeypatch, kind, check, load):
 
 
 def test_a_batch_that_cannot_be_made_is_closed(made, monkeypatch):
-  monkeypatch.setattr(batch_physics.BatchPhysics, '__init__', _raise(Failed))
+  owner = batch_environment.BatchEnvironment
+  monkeypatch.setattr(owner, '__init__', _raise(Failed))
   with pytest.raises(Failed):
     _load_batch()
   assert made.num_made == 1
@@ -120,7 +120,7 @@ class _Sink(events.BatchEventSink):
 @pytest.mark.parametrize(
     ('owner', 'name', 'kind', 'is_batch'),
     [
-        (batch_physics.BatchPhysics, '__init__', Failed, False),
+        (batch_environment.BatchEnvironment, '__init__', Failed, False),
         (batch_environment.BatchEnvironment, 'add_sink', Stopped, True),
         (batch_environment.BatchEnvironment, 'restore', Failed, True),
     ],
