@@ -137,7 +137,6 @@ def walk(spec: Any, case: Case) -> list[np.ndarray]:
 def play(
     case: Case,
     secret: secrets.Secret = secrets.Secret(),  # noqa: B008 - it is immutable.
-    hostile: bool = True,
     leave_out: tuple[str, ...] = (),
 ) -> Transcript:
   """Plays a case, as an agent that asks for everything that there is.
@@ -145,7 +144,6 @@ def play(
   Args:
     case: The case.
     secret: The secret that the agent must not find out.
-    hostile: If `True`, the agent also sends invalid actions.
     leave_out: Keys of observations that are not compared.
   """
   said: list[bytes] = []
@@ -159,7 +157,7 @@ def play(
     sink: Any = _Sink() if not case.num_envs else _BatchSink()
     if secret.has_evaluator:
       env.add_sink(sink)
-    world = _play(env, case, said, hostile, leave_out)
+    world = _play(env, case, said, leave_out)
     env.close()
     said.append(repr(globally == _global_generators()).encode())
     said.append(_state_of(generator))
@@ -171,7 +169,6 @@ def _play(
     env: Any,
     case: Case,
     said: list[bytes],
-    hostile: bool,
     leave_out: tuple[str, ...],
 ) -> list[bytes]:
   """Appends what a view says, and returns what is behind it."""
@@ -179,7 +176,7 @@ def _play(
   said += [repr(sorted(dir(view))).encode(), *_specs(view)]
   world: list[bytes] = []
   for i, action in enumerate(walk(view.action_spec(), case)):
-    if hostile and i % _HOSTILE_EVERY == 3:
+    if i % _HOSTILE_EVERY == 3:
       said.append(_failure(view.step, _HOSTILE[i % len(_HOSTILE)]))
     if i == case.steps - 4:
       said.append(_told(view.reset, leave_out=leave_out))
@@ -360,40 +357,30 @@ def scene(env: environment.Environment) -> bytes:
   """Returns the scene that the agent's camera would draw. Needs no GL."""
   physics = env.physics
   model, data = physics.model.ptr, physics.data.ptr
-  drawn = _scene_of(id(model))
-  if drawn.model is not model:
-    drawn.model, drawn.scene = model, mujoco.MjvScene(model, maxgeom=200)
+  drawn = _scene_of(model)
   camera = mujoco.MjvCamera()
   camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
   camera.fixedcamid = physics.bind(env.task.avatar.camera).element_id
   mujoco.mjv_updateScene(
       model, data, mujoco.MjvOption(), None, camera,
-      mujoco.mjtCatBit.mjCAT_ALL, drawn.scene,
+      mujoco.mjtCatBit.mjCAT_ALL, drawn,
   )  # fmt: skip
   parts = []
-  for geom in drawn.scene.geoms[: drawn.scene.ngeom]:
+  for geom in drawn.geoms[: drawn.ngeom]:
     numbers = [geom.pos, geom.mat.ravel(), geom.size, geom.rgba]
     shading = [geom.emission, geom.specular, geom.shininess, geom.reflectance]
     ids = [geom.type, geom.objid, geom.segid, geom.matid]
     parts += [np.concatenate([*numbers, shading, ids]).tobytes()]
     parts.append(geom.label.encode())
-  for light in drawn.scene.lights[: drawn.scene.nlight]:
+  for light in drawn.lights[: drawn.nlight]:
     parts += [np.concatenate([light.pos, light.dir, light.diffuse]).tobytes()]
   return b'|'.join(parts)
 
 
-class _Drawn:
-  """A scene, which takes long to make."""
-
-  def __init__(self) -> None:
-    self.model: Any = None
-    self.scene: Any = None
-
-
 @functools.lru_cache(maxsize=4)
-def _scene_of(model_id: int) -> _Drawn:
-  del model_id
-  return _Drawn()
+def _scene_of(model: mujoco.MjModel) -> mujoco.MjvScene:
+  """Returns a scene to draw, which takes long to make."""
+  return mujoco.MjvScene(model, maxgeom=200)
 
 
 def _state_of(generator: np.random.RandomState) -> bytes:

@@ -108,13 +108,13 @@ def failures_scanned() -> list[str]:
 
 def contacts_of_meters() -> list[str]:
   """Claim C15."""
-  number = coupling.contacts('collect_apples', 30, 0)
+  number = coupling.contacts('collect_apples', 30)
   return [f'{number} contacts'] * bool(number)
 
 
 def solver_coupling() -> list[str]:
   """Claim C13."""
-  return ['a meter that moves is felt'] * coupling.is_felt_as_loaded(1)
+  return ['a meter that moves is felt'] * coupling.is_felt_as_loaded()
 
 
 # How mutants get at things.
