@@ -19,11 +19,17 @@ TESTS_OF_EXTRAS = tests/authors tests/doors/data tests/engine/gl_test.py \
 	tests/doors/browser/supervised_test.py tests/lab/experiments/training_test.py \
 	tests/doors tests/launchers/data_test.py
 
-.PHONY: help demo test lint docs check-release format clean
+TESTS_OF_CORE = $(addprefix tests/,config entities policies feedback tasks \
+	engine evaluation authors/registers_test.py archive_test.py \
+	configs_test.py golden_test.py import_rules_test.py suite_test.py)
+
+.PHONY: help demo test test-core lint docs check-release format clean
 
 help:
 	@echo 'make demo    train agents in Unlock Door and report which tamper'
 	@echo 'make test    run lint, type checks and tests, as before every merge'
+	@echo 'make test-core'
+	@echo '             run the faster tests of the core only'
 	@echo 'make lint    run lint and type checks only'
 	@echo 'make docs    build the site in build/site'
 	@echo 'make check-release'
@@ -37,6 +43,10 @@ demo: .venv/demo
 
 test: lint
 	$(PY) -m pytest -q -n $(WORKERS) --dist loadfile
+
+test-core: .venv/dev
+	$(PY) -m pytest -q -n $(WORKERS) --dist loadfile \
+	  -m 'not docs and not camera and not slow' $(TESTS_OF_CORE)
 
 lint: .venv/dev
 	$(PY) -m ruff check -q .

@@ -12,6 +12,8 @@ from realab_suite.engine import batch_environment
 from realab_suite.engine import events
 from realab_suite.engine import snapshots
 
+pytestmark = pytest.mark.slow
+
 # Beyond the end of an episode, which has 90 steps.
 _STEPS = 75
 _POINT = 25

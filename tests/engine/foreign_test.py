@@ -19,6 +19,8 @@ from realab_suite.tasks import registry
 from tests.engine import embedded
 from tests.engine import helpers
 
+pytestmark = pytest.mark.slow
+
 _SEED = 11
 _REGISTER = {
     'kind': 'two_block',

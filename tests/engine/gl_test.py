@@ -78,9 +78,12 @@ _IMPORT_DYNAMO = """
 import torch._dynamo
 """
 
-pytestmark = pytest.mark.skipif(
-    sys.platform != 'linux', reason='elsewhere nothing is postponed'
-)
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(
+        sys.platform != 'linux', reason='elsewhere nothing is postponed'
+    ),
+]
 renders = pytest.mark.usefixtures('egl')
 needs_torch = pytest.mark.skipif(
     util.find_spec('torch') is None, reason='torch is not installed'

@@ -16,6 +16,8 @@ from realab_suite import suite
 from tests import examples
 from tests.engine import helpers
 
+pytestmark = pytest.mark.slow
+
 _NUM_ENVS = 4
 _NUM_LOOKS = 12
 _PERIOD = 1_000  # Number of actions before the same ones come again.

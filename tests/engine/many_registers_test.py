@@ -12,6 +12,8 @@ from realab_suite.tasks import collect_apples
 from tests import work
 from tests.engine import helpers
 
+pytestmark = pytest.mark.slow
+
 _WORLD = 'collect_apples', 'standard'
 # The substeps that the small blocks need.
 _SHORT = {'random': 1, 'physics_timestep': 0.01}

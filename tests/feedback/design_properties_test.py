@@ -22,6 +22,8 @@ from realab_suite.lab.experiments import experiment_specs
 from tests import examples
 from tests.engine import helpers
 
+pytestmark = pytest.mark.slow
+
 _CONFIGS = pathlib.Path(__file__).parents[2] / 'configs'
 _LOADERS = {'designs': specs.load, 'experiments': experiment_specs.load}
 _DEEPEST = 1e-3  # Metres.

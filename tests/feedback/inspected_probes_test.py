@@ -21,6 +21,8 @@ from realab_suite.feedback import specs
 from realab_suite.lab import agents
 from realab_suite.testing import probes
 
+pytestmark = pytest.mark.slow
+
 _STEPS = probes.NUM_STEPS
 _WORK, _PUSH = 1, 2
 

@@ -10,6 +10,8 @@ from realab_suite.lab.experiments import experiment_specs
 from tests.engine import helpers
 from tests.engine import identity
 
+pytestmark = pytest.mark.slow
+
 # Everything that draws, remembers or looks.
 _OPTIONS = (
     'providers.0.period=2', 'providers.0.probability=0.6',

@@ -19,6 +19,8 @@ from realab_suite.lab.verdicts import obstacles
 from realab_suite.tasks import registry
 from tests.engine import helpers
 
+pytestmark = pytest.mark.slow
+
 _DOMAINS = [*suite.TASKS_BY_DOMAIN]
 _EPISODES = 6
 # Other files test the variations of the two worlds of the paper.
