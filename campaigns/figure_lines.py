@@ -1,6 +1,6 @@
 """Output of campaigns, `Cxx figure target verdict seed`, and their start."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 import inspect
 import sys
 from typing import NoReturn, final
@@ -47,9 +47,6 @@ class Lines:
   def at_least(self, figure: str, value: float, limit: float) -> None:
     self._print(figure, value, f'>={limit:g}', value >= limit)
 
-  def within(self, figure: str, value: float, low: float, high: float) -> None:
-    self._print(figure, value, f'{low:g}..{high:g}', low <= value <= high)
-
   def _print(
       self, figure: str, value: float, target: str, is_met: bool
   ) -> None:
@@ -59,25 +56,3 @@ class Lines:
         f'{self._campaign} {figure}={value:.6g} {target} {words} {self._seed}',
         flush=True,
     )
-
-
-def print_all(
-    runs: Mapping[str, Callable[[Lines, float, int], None]],
-    scale: float,
-    seed: int,
-    names: Sequence[str],
-) -> int:
-  """Runs several campaigns; returns the number of targets missed.
-
-  Args:
-    runs: Functions that print the lines of a campaign, by name.
-    scale: Scale of each campaign.
-    seed: Seed of each campaign.
-    names: Campaigns to run; all if empty.
-  """
-  missed = 0
-  for name in names or runs:
-    lines = Lines(name, seed)
-    runs[name](lines, scale, seed)
-    missed += lines.num_missed
-  return missed

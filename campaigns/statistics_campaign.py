@@ -312,16 +312,13 @@ def compare(repetitions: int, rng: np.random.Generator) -> None:
       ), flush=True)  # fmt: skip
 
 
-def report(lines: figure_lines.Lines, scale: float, seed: int) -> None:
-  """Prints the figures of C43."""
+def main(scale: float = 1.0, seed: int = 0) -> int:
+  """Prints the figures and returns the number of targets missed."""
+  lines = figure_lines.Lines('C43', seed)
   repetitions = max(1, round(scale * _REPETITIONS))
   _report_intervals(lines, repetitions, np.random.default_rng(seed))
   compare(repetitions, np.random.default_rng(seed))
-
-
-def main(scale: float = 1.0, seed: int = 0) -> int:
-  """Prints the figures and returns the number of targets missed."""
-  return figure_lines.print_all({'C43': report}, scale, seed, ())
+  return lines.num_missed
 
 
 if __name__ == '__main__':

@@ -10,21 +10,6 @@ import numpy as np
 import pytest
 
 _COMPAT = pathlib.Path(__file__).parents[2] / 'compat' / 'labmaze'
-_EXAMPLES = """
-import labmaze
-import numpy as np
-from dm_control.locomotion.examples import basic_cmu_2019, basic_rodent_2020
-for make in (
-    basic_cmu_2019.cmu_humanoid_maze_forage,
-    basic_cmu_2019.cmu_humanoid_heterogeneous_forage,
-    basic_rodent_2020.rodent_maze_forage,
-):
-  env = make(random_state=np.random.RandomState(0))
-  env.task._enabled_observables = []
-  env.physics.render(48, 64, camera_id=0)
-from realab_suite.evaluation import results
-print(labmaze.STAND_IN, results.versions_of_rows()['labmaze'])
-"""
 
 
 def _run(*arguments):
@@ -78,19 +63,9 @@ def test_the_tests_of_mazes_that_dm_control_ships_pass():
   assert '7 passed' in ran.stdout, ran.stdout
 
 
-@pytest.mark.camera
-@pytest.mark.usefixtures('egl')
-def test_examples_of_dm_control_render_and_rows_name_the_stand_in():
-  ran = _run('-c', _EXAMPLES)
-  assert ran.stdout.startswith('True '), ran.stderr
-
-
-@pytest.mark.parametrize('simplify', [False, True])
-@pytest.mark.parametrize('size', [(11, 11), (7, 21), (3, 3)])
-def test_each_free_cell_of_a_random_maze_can_be_reached(
-    labmaze, size, simplify
-):
-  maze = labmaze.RandomMaze(*size, simplify=simplify, random_seed=1)
+@pytest.mark.parametrize('size', [(7, 21), (3, 3)])
+def test_each_free_cell_of_a_random_maze_can_be_reached(labmaze, size):
+  maze = labmaze.RandomMaze(*size, simplify=True, random_seed=1)
   seen = set()
   for _ in range(20):
     maze.regenerate()
@@ -140,23 +115,6 @@ def test_a_fixed_maze_draws_among_the_cells_with_its_tokens(labmaze):
     assert (layer.count('P'), layer.count('G')) == (1, 3)
     assert layer.split('\n')[1][3] == layer.split('\n')[2][1] == 'G'
   assert len(layouts) == 4
-
-
-def test_every_texture_that_a_style_names_is_a_file(labmaze):
-  assets = labmaze.assets
-  paths = [
-      path
-      for style in assets.MAZE_STYLES
-      for paths in (
-          assets.get_wall_texture_paths(style),
-          assets.get_floor_texture_paths(style),
-      )
-      for path in paths.values()
-  ]
-  paths += [
-      p for s in assets.SKY_STYLES for p in assets.get_sky_texture_paths(s)
-  ]
-  assert {pathlib.Path(path).read_bytes()[:4] for path in paths} == {b'\x89PNG'}
 
 
 def test_wrong_arguments_are_refused(labmaze):
