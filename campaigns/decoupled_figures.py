@@ -8,22 +8,14 @@ of training at its end that "gain in training" is the mean of:
 
 Means with intervals over the seeds that have finished. Beside what `report`
 shows: the gain with its sign in units a step, in evaluation and at the end of
-training, and the share of episodes in which any register was moved. A folder
-of a sweep has learners, and gets the gain of greedy actions, in the same
-episodes; published results have none.
+training, and the share of episodes in which any register was moved.
 """
 
-import contextlib
 import math
 import pathlib
 import sys
 
-from realab_suite.evaluation import evaluate
-from realab_suite.lab.experiments import experiment_specs
-from realab_suite.lab.experiments import jobs
-from realab_suite.lab.experiments import scheduler
 from realab_suite.lab.experiments import sweep_results
-from realab_suite.lab.experiments import training
 from realab_suite.lab.verdicts import comparison
 from realab_suite.lab.verdicts import intervals
 from realab_suite.lab.verdicts import stakes
@@ -36,7 +28,6 @@ _PERCENT = (0.0, 100.0)
 _COLUMNS = {
     'true return': 'true',
     'gain': 'gain',
-    'gain of greedy actions': 'greedy',
     'gain in training': 'training',
     'relative gain': 'relative',
     'hack rate (%)': 'hacked',
@@ -44,50 +35,14 @@ _COLUMNS = {
 }
 
 
-def greedy_gains(folder: pathlib.Path) -> dict[str, dict[int, list[float]]]:
-  """Returns the gains of greedy actions, by run and seed, in units a step.
-
-  Args:
-    folder: Folder of a sweep.
-  """
-  gains: dict[str, dict[int, list[float]]] = {}
-  if not (folder / scheduler.EXPERIMENT).exists():
-    return gains
-  experiment = experiment_specs.load(folder / scheduler.EXPERIMENT)
-  for job in jobs.plan(experiment):
-    path = folder / job.folder()
-    if not (jobs.is_done(path) and (path / training.LEARNER).exists()):
-      continue
-    episodes = job.experiment.evaluation.episodes
-    with contextlib.closing(
-        job.experiment.world.load_batch(
-            job.design, episodes, job.evaluation_seed
-        )
-    ) as batch:
-      learner = training.load_learner(job, path, batch)
-      actor = training.LearnerActor(learner, job.evaluation_seed, greedy=True)
-      parts = [
-          one.objective['mean'] for one in evaluate.evaluate_batch(batch, actor)
-      ]
-    gains.setdefault(job.run, {})[job.seed] = [
-        part.observed - part.clean for part in parts
-    ]
-  return gains
-
-
-def figures(
-    run: sweep_results.Run,
-    greedy: dict[int, list[float]] | None = None,
-    share: float = 0.25,
-) -> list[str]:
+def figures(run: sweep_results.Run, share: float) -> list[str]:
   """Returns the figures of a run: text with intervals.
 
   Args:
     run: A run of which seeds have finished.
-    greedy: Gains of greedy actions, by seed.
     share: Share of training, at its end, whose gain is a figure.
   """
-  columns = {'greedy': greedy} if greedy else {}
+  columns: dict[str, dict[int, list[float]]] = {}
 
   def add(name: str, seed: int, value: float) -> None:
     columns.setdefault(name, {}).setdefault(seed, []).append(value)
@@ -133,12 +88,11 @@ def main(folder: str, share: str = '0.25') -> None:
     share: As in `figures`.
   """
   path = pathlib.Path(folder)
-  greedy = greedy_gains(path)
   print('| ' + ' | '.join(['run', 'seeds', *_COLUMNS]) + ' |')
   print('|---|' + '---|' * (len(_COLUMNS) + 1))
   for name, run in sweep_results.load(path).runs.items():
     if run.rows:
-      cells = figures(run, greedy.get(name), float(share))
+      cells = figures(run, float(share))
       print(f'| `{name}` | {len(run.configs)} | ' + ' | '.join(cells) + ' |')
 
 

@@ -226,20 +226,6 @@ def test_a_wrong_function_is_named(measure: Any, complaint: str):
 
 
 @pytest.mark.parametrize(
-    ('fields', 'complaint'),
-    [
-        ({'size': 0.01}, 'size 0.01; allowed are 0.06 to 1'),
-        ({'mass': 0}, 'mass 0; allowed are 0.01 to 100'),
-    ],
-)
-def test_crates_are_as_large_and_heavy_as_blocks(
-    fields: dict[str, Any], complaint: str
-):
-  with pytest.raises(errors.SpecError, match=f"crate 'box': {complaint}"):
-    crates.Crate('box', **fields)
-
-
-@pytest.mark.parametrize(
     ('position', 'spread'),
     [
         ((0.0, -3.9), (0.0, 0.0)),

@@ -115,17 +115,3 @@ def test_a_fixed_maze_draws_among_the_cells_with_its_tokens(labmaze):
     assert (layer.count('P'), layer.count('G')) == (1, 3)
     assert layer.split('\n')[1][3] == layer.split('\n')[2][1] == 'G'
   assert len(layouts) == 4
-
-
-def test_wrong_arguments_are_refused(labmaze):
-  for arguments in (
-      {'height': 4},
-      {'room_min_size': 6},
-      {'max_variations': 27},
-  ):
-    with pytest.raises(ValueError, match='allowed are'):
-      labmaze.RandomMaze(**arguments)
-  with pytest.raises(ValueError, match='allowed are'):
-    labmaze.assets.get_sky_texture_paths('sky_09')
-  with pytest.raises(ValueError, match='one length'):
-    labmaze.TextGrid('**\n*\n')

@@ -125,15 +125,6 @@ def test_wrong_options_are_refused_when_a_design_is_loaded(
   assert ';' not in text.replace('; did you mean', '').replace('; known', '')
 
 
-@pytest.mark.parametrize('depth', [1, 3])
-def test_wrong_options_of_inner_policies_are_refused(depth: int):
-  design = _wrapped(depth, 'apple_seeker', {'half_width': 'wide'})
-  assert refusals.refusal(specs.load, design) == (
-      f'design: providers[0].options{".inner_options" * depth}.half_width: must'
-      " be a valid number, got 'wide'"
-  )
-
-
 @pytest.mark.parametrize(
     ('policy', 'options'),
     [

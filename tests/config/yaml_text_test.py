@@ -90,11 +90,6 @@ def test_values_at_the_limits_are_accepted():
   assert repr(loaded['deep']) == '[' * 31 + ']' * 31
 
 
-def test_a_file_name_with_a_newline_is_escaped_in_the_message():
-  message = refusals.refusal(loading.parse_yaml, '1', 'a\nb')
-  assert message.startswith(r'a\nb: expected a mapping')
-
-
 _PIECES = st.sampled_from(
     [
         *'[]{},:-?&*!|>%@`"\'# \n\t\r\0~=.<\\',

@@ -15,7 +15,6 @@ import pytest
 from realab_suite import _display
 from realab_suite import errors
 from realab_suite.lab.experiments import experiment_specs
-from realab_suite.lab.experiments import requirements
 from realab_suite.lab.experiments import scripted
 from realab_suite.launchers import compare
 from realab_suite.launchers import explore
@@ -222,21 +221,6 @@ def test_exploring_where_no_window_opens_makes_a_film(monkeypatch):
   assert 'RuntimeError: no windows here' in ended.stdout
 
 
-@pytest.mark.parametrize(
-    ('flags_of_world', 'name'),
-    [
-        ((), 'carrying_saboteur'),
-        (('--policy=random',), 'random'),
-        (('--design=none',), 'random'),
-    ],
-)
-def test_a_saboteur_is_shown_where_it_can_attack(flags_of_world, name):
-  with flagsaver.flagsaver():
-    absl_flags.FLAGS(['explore', *flags_of_world])
-    with explore._loaded() as (_, _, shown):
-      assert shown == name
-
-
 def test_with_a_display_the_viewer_gets_a_world_and_a_policy(monkeypatch):
   lengths = []
 
@@ -323,9 +307,3 @@ def test_a_renderer_that_works_is_chosen(monkeypatch):
   assert renderers.choose_renderer() is None
   assert tried == ['glfw', 'egl']
   assert os.environ['MUJOCO_GL'] == 'egl'
-
-
-def test_missing_modules_are_named_with_the_command_to_install_them():
-  assert requirements.missing('json', 'os') is None
-  problem = requirements.missing('json', 'no_such_module')
-  assert problem.startswith('no_such_module not installed; run: ')

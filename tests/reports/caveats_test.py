@@ -3,7 +3,6 @@
 import csv
 
 from realab_suite.lab.experiments import sweep_results
-from realab_suite.lab.experiments import training
 from realab_suite.lab.verdicts import verdicts
 from realab_suite.reports import caveats
 from realab_suite.reports import html_page
@@ -60,33 +59,4 @@ def test_failed_episodes_are_left_out_and_forbid_a_favourable_label(
   assert judgement.reason == 'all of its episodes failed'
   assert (
       'Episodes that failed, for example because the physics diverged: ' in text
-  )
-
-
-def test_intervals_in_a_report_stay_in_bounds(five):
-  for one in numbers.compute(sweep_results.load(five)).values():
-    assert one.summary.true_return.bounds == (0.0, 18.0)
-    assert one.summary.true_return.high <= 18
-    for interval in (
-        one.summary.corruption, *one.means.values(), *one.outcomes.values(),
-    ):  # fmt: skip
-      assert interval.bounds[0] == 0
-      assert interval.low >= 0
-    for share in (one.hacking.rate, one.outcomes['door_opened']):
-      assert share.bounds == (0.0, 1.0)
-      assert share.high <= 1
-
-
-def test_rows_without_a_largest_return_give_a_caveat(own_five, tmp_path):
-  for seed in range(5):
-    pages.spoil(
-        own_five, 'decoupled', seed, training.EPISODES,
-        lambda data: data.replace(b',"max_true_return":18.0', b''),
-    )  # fmt: skip
-  figures = numbers.compute(sweep_results.load(own_five))
-  assert figures['decoupled'].summary.true_return.bounds == (0.0, None)
-  text = pages.text(pages.write(own_five, tmp_path / 'out'))
-  assert (
-      'so intervals of their true returns have no upper bound: decoupled.'
-      in text
   )

@@ -5,8 +5,6 @@ import json
 
 import pytest
 
-from realab_suite import errors
-from realab_suite.lab.experiments import scheduler
 from realab_suite.lab.experiments import sweep_results
 from realab_suite.lab.experiments import training
 from realab_suite.lab.verdicts import verdicts
@@ -164,11 +162,3 @@ def test_all_figures_are_in_the_csv_files(five, tmp_path):
     seeds = list(csv.DictReader(file))
   labels = [record['label'] for record in seeds if record['run'] == 'reward']
   assert labels == 5 * ['tampers']
-
-
-def test_an_audit_of_another_run_is_refused(own_five):
-  path = own_five / scheduler.AUDITS
-  path.mkdir()
-  (path / 'other.json').write_text('{}')
-  with pytest.raises(errors.ResultsError, match='not the audit of a run'):
-    _lines(own_five)

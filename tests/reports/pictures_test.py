@@ -89,15 +89,6 @@ def test_titles_of_a_time_line_do_not_collide(recorded, canvases):
     assert not one.overlaps(other)
 
 
-def test_a_world_without_registers_is_drawn(tmp_path):
-  settings = small.settings(
-      tmp_path / 'new', design='none', policies=('no_op',), channels=()
-  )
-  scripted.run(settings, lambda line: None, plots.draw)
-  drawn = [path.name for path in (tmp_path / 'new' / 'plots').iterdir()]
-  assert drawn == ['trajectories.png']
-
-
 def test_pictures_show_corruption_that_a_meter_passed_on(tmp_path, track):
   strip = films.draw_strip('run', track, 480)
   plots.draw_time_line({'run': track}, tmp_path / 'before.png')

@@ -1,53 +1,8 @@
-"""Tests of plots: axes, curves, bands and styles."""
+"""Tests of plots: curves and bands."""
 
-import numpy as np
 import pytest
 
-from realab_suite.lab.experiments import sweep_results
-from realab_suite.reports import numbers
 from realab_suite.reports import plots
-
-
-@pytest.fixture(name='canvases')
-def _canvases(monkeypatch):
-  """The figures that charts are made of."""
-  canvases = []
-  to_svg = plots.to_svg
-  monkeypatch.setattr(
-      plots,
-      'to_svg',
-      lambda canvas: canvases.append(canvas) or to_svg(canvas),
-  )
-  return canvases
-
-
-def _drawn(folder, chart, canvases, run=None):
-  """Draws a chart of a sweep, or of one of its runs; returns its figure."""
-  sweep = sweep_results.load(folder)
-  figures = numbers.compute(sweep)
-  if run is not None:
-    runs = {name: one for name, one in sweep.runs.items() if name == run}
-    sweep = sweep_results.Sweep(folder, {}, False, runs, (), {})
-  styles = plots.styles([one.name for one in sweep.learned()])
-  picture = chart(sweep, figures, styles)
-  assert picture.uri.startswith('data:image/svg+xml;base64,')
-  [canvas] = canvases
-  return canvas
-
-
-def test_curves_and_bands_keep_away_from_the_edges(folder, canvases):
-  for ax in _drawn(folder, plots.learning, canvases).axes:
-    low, high = ax.get_ylim()
-    scale = ax.yaxis.get_transform().transform
-    ends = [line.get_ydata() for line in ax.lines]
-    ends += [
-        path.vertices[:, 1] for band in ax.collections
-        for path in band.get_paths()
-    ]  # fmt: skip
-    values = scale(np.concatenate([np.asarray(one, float) for one in ends]))
-    low, high = scale(np.array([low, high]))
-    assert low + 0.05 * (high - low) < values.min()
-    assert values.max() < high - 0.05 * (high - low)
 
 
 def test_a_curve_has_a_point_per_length_of_an_episode():
@@ -76,9 +31,3 @@ def test_a_band_is_the_interval_over_seeds():
   assert one.steps.tolist() == [100, 200]
   assert one.mean.tolist() == [1.5, 5.0]
   assert one.low[0] < 1.0 < 2.0 < one.high[0]
-
-
-def test_thirty_designs_have_thirty_styles():
-  names = [f'design {i}' for i in range(30)]
-  looks = plots.styles(names)
-  assert len(set(looks.values())) == 30

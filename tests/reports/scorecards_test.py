@@ -272,17 +272,6 @@ def test_the_files_show_each_cell(sweep, tmp_path):
   assert again == data
 
 
-@pytest.mark.parametrize(
-    ('arguments', 'complaint'),
-    [
-        ([], '--input, --experiment: allowed is one of them'),
-        (['--input=nowhere'], 'nowhere: not a sweep, and without rows'),
-    ],
-)
-def test_a_wrong_command_is_refused_in_one_line(arguments, complaint):
-  assert complaint in in_process.complaint(scorecard, *arguments)
-
-
 def test_the_program_reads_folders_and_published_results(sweep, tmp_path):
   published = tmp_path / 'published'
   publishing.publish(sweep, published)

@@ -14,7 +14,6 @@ from realab_suite.lab.experiments import tables
 from realab_suite.lab.experiments import training
 from realab_suite.lab.verdicts import comparison
 from realab_suite.reports import html_page
-from realab_suite.reports import plots
 from tests.lab.experiments import fake_sweep
 from tests.reports import pages
 
@@ -80,21 +79,6 @@ def test_the_report_shows_each_stage_with_its_task(built, page, run):
     assert ' '.join(words[3:]) == ' '.join(
         map(tables.text, (one.true_return, one.observed_return, one.corruption))
     )
-
-
-def test_the_learning_curves_show_where_adaptation_begins(built, monkeypatch):
-  canvases = []
-  monkeypatch.setattr(plots, 'to_svg', lambda one: canvases.append(one) or b'')
-  sweep = sweep_results.load(built)
-  styles = plots.styles([one.name for one in sweep.learned()])
-  plots.learning(sweep, {}, styles)
-  [canvas] = canvases
-  assert len(canvas.axes) == 6
-  for ax in canvas.axes:
-    ends = [list(line.get_xdata()) for line in ax.lines]
-    assert ends.count([20_000, 20_000]) == 1
-  labels = [text.get_text() for text in canvas.legends[0].get_texts()]
-  assert labels.count('adaptation begins') == 1
 
 
 def test_stages_are_published(built, tmp_path):

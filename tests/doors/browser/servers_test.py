@@ -12,7 +12,6 @@ pytest.importorskip('websockets')
 from websockets import exceptions
 from websockets.sync import client
 
-from realab_suite import errors
 from realab_suite.doors.browser import servers
 from tests import patience
 
@@ -95,9 +94,3 @@ def test_messages_that_cannot_be_parsed_are_dropped(server):
     connection.send('{"type": "run"}')
     message = server.receive(60.0)  # Not longer: a failure never answers.
   assert message == {'type': 'run'}
-
-
-def test_a_port_in_use_is_refused(server):
-  port = int(server.url.split(':')[2].split('/')[0])
-  with pytest.raises(errors.SpecError, match='cannot serve a page'):
-    servers.PageServer('supervise', port=port)

@@ -101,14 +101,6 @@ def test_an_answer_with_an_impossible_time_is_dropped(tmp_path, time):
   assert not [one for one in answers if one['asks'] == 'approval']
 
 
-def test_the_clips_of_a_comparison_have_their_length(tmp_path):
-  page = FakePage()
-  design = supervised_designs.design('comparison', 'live', clip=3)
-  _supervise(page, tmp_path, design, max_steps=12)
-  assert page.asked() == ['comparison'] * 2
-  assert page.clip_views == ([1] * 3 + [2] * 3) * 2
-
-
 def test_a_stop_after_the_last_step_does_not_end_the_next_episode(tmp_path):
   def react(page, content):
     if content['type'] == 'step' and content['step'] == 5:

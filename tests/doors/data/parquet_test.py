@@ -2,7 +2,6 @@
 
 import json
 
-from dm_env import specs as dm_env_specs
 import numpy as np
 import pytest
 
@@ -60,13 +59,6 @@ def test_arrays_keep_their_types_and_shapes(tmp_path):
   action = table.schema.field('action')
   assert json.loads(action.metadata[b'names']) == ['forward', 'turn']
   assert json.loads(action.metadata[b'maximum']) == 1.0
-
-
-def test_discrete_actions_are_plain_numbers(tmp_path):
-  spec = dm_env_specs.DiscreteArray(5, name='steps/v1')
-  table = _written(tmp_path, [made.stream([3, 4], spec)])
-  assert table.schema.field('action').type == pa.int32()
-  assert table.column('action').to_pylist() == [3, 4, None]
 
 
 def test_memory_is_bounded_by_groups_of_rows(tmp_path, monkeypatch):

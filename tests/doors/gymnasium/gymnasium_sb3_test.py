@@ -80,16 +80,6 @@ def test_ppo_learns_from_a_batch(flat, classes):
   assert model.policy.features_extractor.features_dim == 43 + 32 * num_classes
 
 
-def test_dqn_learns_from_one_world():
-  env = gym.make(_NAME, flat=True, **_OPTIONS)
-  model = stable_baselines3.DQN(
-      'MlpPolicy', env, learning_starts=8, buffer_size=100, device='cpu'
-  )
-  model.learn(16)
-  action, _ = model.predict(env.reset()[0])
-  assert env.action_space.contains(action)
-
-
 def test_only_batches_with_resets_in_the_same_step_are_accepted():
   with pytest.raises(errors.SpecError, match='SameStep'):
     sb3.RealabVecEnv(_make('NextStep'))

@@ -20,7 +20,6 @@ from realab_suite.doors.gymnasium import codecs
 from realab_suite.doors.gymnasium import evaluation
 from realab_suite.doors.gymnasium import registration
 from realab_suite.doors.gymnasium import single
-from realab_suite.doors.gymnasium import vector
 from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
 from realab_suite.engine import single_physics
@@ -228,16 +227,6 @@ def test_wrong_options_are_refused(options, message):
     registration.make('unlock_door', 'near', 'instantaneous_reward', **options)
 
 
-def test_options_may_be_values_of_numpy():
-  env = _make(
-      flat=np.bool_(True), dtype=np.float64, height=np.int64(32),
-      width=np.int32(48),
-  )  # fmt: skip
-  assert isinstance(env.observation_space, gym.spaces.Box)
-  assert env.observation_space.dtype == np.float64
-  assert env._interface.frame[1:] == (32, 48)
-
-
 @pytest.mark.parametrize(
     ('option', 'hint'),
     [('overides', 'overrides'), ('num_thread', 'num_threads')],
@@ -383,14 +372,6 @@ def test_wrong_masks_are_refused(mask):
   envs.reset()
   with pytest.raises(errors.SpecError, match='reset_mask'):
     envs.reset(options={'reset_mask': mask})
-
-
-def test_a_batch_takes_seeds_of_single_worlds():
-  envs = _make_vec()
-  first, _ = envs.reset(seed=[7, 8, 9])
-  expected, _ = _sync('NextStep').reset(seed=[7, 8, 9])
-  _assert_same(first, expected)
-  assert isinstance(envs, vector.RealabVectorEnv)
 
 
 def test_an_evaluation_is_that_of_the_evaluator():

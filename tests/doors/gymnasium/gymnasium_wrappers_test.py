@@ -74,34 +74,6 @@ def test_stacks_of_a_batch_are_those_of_its_worlds(mode, flat):
     is_over = steps[0][2] | steps[0][3]
 
 
-@pytest.mark.camera
-def test_pixels_are_the_image_of_the_camera():
-  kwargs: Any = {
-      'task_kwargs': {'camera_size': (16, 16)},
-      'environment_kwargs': {'senses': ['camera']},
-  }
-  # As on the page, with Gymnasium's own wrappers.
-  key = 'senses_camera'
-  env = gym.make(_NEAR, **kwargs)
-  env = gym.wrappers.TransformObservation(
-      env, lambda o: o[key], env.observation_space[key]
-  )
-  envs = gym.make_vec(_NEAR, num_envs=2, **kwargs)
-  envs = gym.wrappers.vector.TransformObservation(
-      envs,
-      lambda o: o[key],
-      single_observation_space=envs.single_observation_space[key],
-  )
-  space = gym.spaces.Box(0, 255, (16, 16, 3), np.uint8)
-  assert env.observation_space == envs.single_observation_space == space
-  one, _ = env.reset(seed=4)
-  many, _ = envs.reset(seed=4)
-  assert one in env.observation_space
-  assert many in envs.observation_space
-  np.testing.assert_array_equal(many[0], one)
-  assert envs.step(envs.action_space.sample())[0].shape == (2, 16, 16, 3)
-
-
 # MoviePy 1.0.3 has such strings, which Python reports when it compiles them.
 @pytest.mark.filterwarnings('ignore:invalid escape sequence')
 @pytest.mark.camera

@@ -152,21 +152,6 @@ def test_one_thread_alone_runs_the_world():
     assert threads == {serving.thread.ident}
 
 
-def test_after_the_last_episode_the_server_ends():
-  with served.in_thread(num_episodes=1) as serving:
-    with served.Client(serving.address) as client:
-      client.join()
-      states = [client.step(np.zeros(6)).state for _ in range(21)]
-      assert states[-1] == pb.INTERRUPTED
-      with pytest.raises(
-          error.DmEnvRpcError, match='there are no more episodes'
-      ):
-        client.step()
-    serving.thread.join(patience.SECONDS)
-    assert not serving.thread.is_alive()
-    assert serving.ends() == ['timeout']
-
-
 def test_a_failing_provider_ends_the_episode_and_reveals_nothing(caplog):
   def fail(world):
     mechanism = world._env.mechanism
