@@ -236,3 +236,9 @@ def test_a_crate_outside_of_the_rooms_is_refused(position: Any, spread: Any):
   yard = Yard()
   with pytest.raises(errors.SpecError, match=r"crate 'far': pos.*allowed"):
     yard.add_crate(crates.Crate('far'), position, spread)
+
+
+def test_crates_are_as_large_and_heavy_as_blocks():
+  for fields, complaint in (({'size': np.nan}, 'size'), ({'mass': 0}, 'mass')):
+    with pytest.raises(errors.SpecError, match=f"crate 'box': {complaint}"):
+      crates.Crate('box', **fields)

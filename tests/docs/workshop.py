@@ -231,7 +231,7 @@ def _live(
   except ModuleNotFoundError as error:
     traceback.print_exc()
     status = 1
-    if error.name in _packages_of_extras():
+    if error.name in pages.packages_of_extras():
       _note(notes, f'skipped: {error.name} is not installed')
       status = SKIPPED
   except Exception as error:
@@ -369,25 +369,12 @@ def _check_module(name: str, *arguments: str) -> None:
     raise _Done('checked: it takes minutes; it can be imported')
 
 
-def _packages_of_extras() -> set[str]:
-  text = (pages.ROOT / 'setup.cfg').read_text()
-  extras = text.partition('[options.extras_require]')[2].partition('\n[')[0]
-  names = re.findall(r'^    ([\w-]+)', extras, re.MULTILINE)
-  return {name.replace('-', '_') for name in names} | {'torch', 'ray'}
-
-
-def _extras() -> set[str]:
-  text = (pages.ROOT / 'setup.cfg').read_text()
-  extras = text.partition('[options.extras_require]')[2].partition('\n[')[0]
-  return set(re.findall(r'^(\w+) =$', extras, re.MULTILINE))
-
-
 def _check_files(arguments: list[str]) -> None:
   """Fails if an argument names an extra or a file that does not exist."""
   for argument in arguments:
     path, _, extras = argument.partition('[')
     for extra in filter(None, extras.rstrip(']').split(',')):
-      if extra not in _extras():
+      if extra not in pages.extras():
         sys.exit(f'{argument}: the extra {extra} does not exist')
     is_file = '/' in path or re.search(r'\.(?:txt|py|ipynb)$', path)
     if is_file and not re.match('-|dist/|https?:', path) and '<' not in path:
