@@ -34,51 +34,18 @@ def _with(index: int, value: float) -> np.ndarray:
   return action
 
 
-class _Hostile:
-  """Raises an error when it is converted to an array."""
-
-  def __init__(self, error: type[Exception]) -> None:
-    self._error = error
-
-  def __array__(self, *args: Any, **kwargs: Any) -> Any:
-    raise self._error('no')
-
-  def __repr__(self) -> str:
-    return 'two\nlines'
-
-
 _BAD_ACTIONS: dict[str, tuple[Any, str]] = {
     'nan': (_with(0, _NAN), 'action[0] (forward) is nan'),
-    'all nan': (np.full(6, _NAN), 'action[0] (forward) is nan'),
     'inf': (_with(2, _INF), 'action[2] (turn) = inf outside [-1, 1]'),
-    '-inf': (_with(5, -_INF), 'action[5] (throw) = -inf outside [-1, 1]'),
-    '5.0': (_with(1, 5.0), 'action[1] (strafe) = 5.0 outside [-1, 1]'),
     'barely': (_with(1, np.nextafter(1, 2)), 'action[1] (strafe) = 1.0000'),
     'int': (_with(4, -2).astype(int), 'action[4] (grasp) = -2.0 outside'),
-    'unsigned': (np.full(6, 200, np.uint8), 'action[0] (forward) = 200.0'),
-    'float16': (_with(3, _INF).astype(np.float16), 'action[3] (look) = inf'),
-    'longdouble': (np.full(6, np.longdouble('1e4000')), '= inf outside'),
     'scalar': (0.5, 'shape (), expected (6,)'),
     'number': (3, 'expected (6,); the number of an action needs'),
     'shape (1, 6)': (np.zeros((1, 6)), 'shape (1, 6), expected (6,)'),
-    'shape (7,)': (np.zeros(7), 'shape (7,), expected (6,)'),
-    'empty list': ([], 'shape (0,), expected (6,)'),
     'bool': (np.zeros(6, bool), 'dtype bool'),
     'None': (None, 'dtype object'),
-    'str': ('forward', 'dtype <U7'),
-    'numbers as text': (['0'] * 6, 'dtype <U1'),
-    'bytes': (b'000000', 'dtype |S6'),
-    'array of objects': (np.zeros(6, object), 'dtype object'),
-    'complex': (np.zeros(6, complex), 'dtype complex128'),
-    'dict': ({'forward': 1.0}, 'dtype object'),
-    'date': (np.zeros(6, 'datetime64[s]'), 'dtype datetime64[s]'),
-    'record': (np.zeros(6, [('a', float)]), 'action: dtype'),
     'ragged': ([[1.0], [1.0, 2.0]], 'action: '),
-    'huge integers': ([10**400] * 6, 'dtype object'),
-    'generator': ((0.0 for _ in range(6)), 'dtype object'),
     'masked': (np.ma.zeros(6), 'masked'),
-    'TypeError': (_Hostile(TypeError), 'action: '),
-    'RuntimeError': (_Hostile(RuntimeError), 'action: '),
 }
 
 
@@ -124,7 +91,7 @@ def fixture_pair(running: Any, twin: Any) -> tuple[Any, Any]:
   return running, twin
 
 
-@pytest.mark.parametrize('dtype', [np.float16, np.float32, np.int8, np.uint64])
+@pytest.mark.parametrize('dtype', [np.float32, np.int8])
 def test_other_number_types_are_cast(pair: Any, dtype: Any):
   env, twin = pair
   action = np.array([1, 0, 1, 0, 0, 0])
@@ -153,9 +120,7 @@ def test_an_action_is_neither_kept_nor_changed(pair: Any):
                 'action (dmlab_like/v1) = 14.0 outside [0, 13]': 14,
                 'action (dmlab_like/v1) = -1.0 outside [0, 13]': -1,
                 'dtype float64': 1.0,
-                'dtype bool': True,
                 'shape (1,), expected ()': [1],
-                'dtype object': None,
             },
             (0, np.int64(13), np.uint8(5), np.array(3)),
         ),
@@ -164,8 +129,6 @@ def test_an_action_is_neither_kept_nor_changed(pair: Any):
             (*_INDEX, *_QUERY),
             {
                 'action[0] (query/query) = 14.0 outside [0, 13]': [14.0, 0],
-                'action[0] (query/query) is nan': [_NAN, 0],
-                'action[1] (dmlab_like/v1) = 14.0 outside': [3.0, 14],
                 'action[1] (dmlab_like/v1) is nan': [3.0, _NAN],
                 'shape (1,), expected (2,)': [3.0],
             },

@@ -6,7 +6,6 @@ import dm_env
 import numpy as np
 import pytest
 
-from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import single_physics
 
@@ -57,26 +56,6 @@ def test_frames_of_a_batch_equal_frames_of_single_worlds():
   assert len(np.unique(frames.reshape(_NUM_ENVS, -1), axis=0)) == _NUM_ENVS
   spec = batch.observation_spec()['senses/camera']
   assert spec.shape == (*_SIZE, 3)
-  batch.close()
-  for single in singles:
-    single.close()
-
-
-@pytest.mark.camera
-def test_frames_are_not_shared_and_drawing_changes_nothing():
-  seeing, blind = _load(), _load(size=None)
-  rng = np.random.default_rng(0)
-  frames, kept = [], []
-  for _ in range(_MAX_STEPS):
-    actions = rng.uniform(-1.0, 1.0, (_NUM_ENVS, 6))
-    frames.append(seeing.step(actions).observation['senses/camera'])
-    kept.append(frames[-1].copy())
-    blind.step(actions)
-    seeing.render([0], height=32, width=32)
-    assert seeing.physics.state.tobytes() == blind.physics.state.tobytes()
-  np.testing.assert_array_equal(frames, kept)
-  seeing.close()
-  blind.close()
 
 
 @pytest.mark.camera
@@ -117,50 +96,3 @@ def test_only_the_worlds_that_are_asked_for_are_drawn():
   eyes = env.render([1], 'avatar/egocentric', 48, 64)
   assert (eyes != everybody[1]).any()
   env.close()
-
-
-@pytest.mark.camera
-def test_a_film_is_of_the_quality_of_one_world():
-  batch, single = _load(size=None), _load_alone(1)
-  batch.reset()
-  single.reset()
-  expected = single.physics.render(48, 64, camera_id='top_down')
-  np.testing.assert_array_equal(
-      batch.render([1], height=48, width=64)[0], expected
-  )
-  batch.close()
-  single.close()
-
-
-@pytest.mark.camera
-def test_a_frame_that_is_too_large_is_refused():
-  env = _load(size=None)
-  env.reset()
-  with pytest.raises(errors.RenderingError, match='top_down: no frame of 9999'):
-    env.render([0], height=9999, width=9999)
-  env.close()
-
-
-@pytest.fixture(name='env')
-def fixture_env():
-  env = _load(size=None)
-  yield env
-  env.close()
-
-
-def test_a_camera_that_is_not_there_is_refused(env):
-  with pytest.raises(errors.SpecError, match=r"camera: 'side'.*'top_down'"):
-    env.render([0], 'side')
-
-
-@pytest.mark.parametrize('worlds', [[-1], [_NUM_ENVS], [], [0.5], 1, [0, 0]])
-def test_worlds_that_are_not_there_are_not_drawn(env, worlds):
-  with pytest.raises(errors.SpecError, match=r'worlds: .*from 0 to 2'):
-    env.render(worlds)
-
-
-def test_a_closed_batch_draws_nothing():
-  env = _load(size=None)
-  env.close()
-  with pytest.raises(errors.ClosedError):
-    env.render([0])

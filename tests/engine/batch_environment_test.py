@@ -51,15 +51,6 @@ def test_worlds_differ_from_each_other(batch):
   assert len(np.unique(position, axis=0)) == _NUM_ENVS
 
 
-@pytest.mark.parametrize(
-    'actions', [np.zeros(6), np.zeros((_NUM_ENVS + 1, 6)), np.zeros((1, 6))]
-)
-def test_actions_of_a_wrong_leading_shape_are_refused(batch, actions):
-  batch.reset()
-  with pytest.raises(errors.ActionError, match=r'shape .*expected \(3, 6\)'):
-    batch.step(actions)
-
-
 def test_a_bad_action_of_one_world_is_named_and_nothing_moves(batch):
   batch.reset()
   before = batch.physics.state.copy()

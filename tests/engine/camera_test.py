@@ -6,7 +6,6 @@ import subprocess
 import sys
 import threading
 
-import mujoco
 import numpy as np
 import pytest
 
@@ -78,26 +77,16 @@ def _apple_world():
 
 
 @pytest.mark.camera
-def test_a_frame_is_of_its_size_and_the_callers_own():
-  physics, camera = _apple_world()
-  first = cameras.render(physics, camera, 48, 80)
-  again = cameras.render(physics, camera, 48, 80)
-  assert first.shape == (48, 80, 3)
-  assert first.dtype == np.uint8
-  assert first.flags.owndata
-  assert first.flags.c_contiguous
-  assert not np.shares_memory(first, again)
-  assert first.tobytes() == again.tobytes()
-
-
-@pytest.mark.camera
 def test_an_apple_on_the_left_is_red_on_the_left_and_below_the_horizon():
   physics, camera = _apple_world()
-  frame = cameras.render(physics, camera, 64, 64).astype(int)
-  red = frame[..., 0] > 2 * frame[..., 1:].max(axis=-1)
-  assert red[32:, :32].sum() > 15
-  assert red[:, 32:].sum() == 0
-  assert red[:32].sum() == 0
+  frame = cameras.render(physics, camera, 48, 80)
+  again = cameras.render(physics, camera, 48, 80)
+  assert (frame.shape, frame.dtype) == ((48, 80, 3), np.uint8)
+  assert not np.shares_memory(frame, again)
+  assert frame.tobytes() == again.tobytes()
+  is_red = frame[..., 0] > 2.0 * frame[..., 1:].max(axis=-1)
+  assert is_red[24:, :40].sum() > 10
+  assert is_red.sum() == is_red[24:, :40].sum()
 
 
 @pytest.mark.camera
@@ -137,31 +126,6 @@ def test_environments_of_different_sizes_draw_by_turns():
   envs[0].rewind()
   np.testing.assert_array_equal(_frame(envs[0].reset()), alone[0][0])
   envs[0].close()
-
-
-@pytest.mark.camera
-def test_there_is_one_renderer_from_the_first_frame_until_close(monkeypatch):
-  made, freed = [], []
-
-  class Context(mujoco.MjrContext):
-
-    def __init__(self, *args):
-      super().__init__(*args)
-      made.append((self.offHeight, self.offWidth, self.offSamples))
-
-    def free(self):
-      freed.append(self)
-      super().free()
-
-  monkeypatch.setattr(mujoco, 'MjrContext', Context)
-  env = _load((40, 24))
-  assert not made
-  for _ in range(3):
-    env.reset()
-  assert made == [(40, 24, 0)]
-  assert not freed
-  env.close()
-  assert len(freed) == 1
 
 
 @pytest.mark.camera

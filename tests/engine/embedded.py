@@ -159,6 +159,3 @@ def without_cameras(task: composer.Task) -> composer.Task:
 def make_composer(name: str) -> composer.Task:
   """Returns a new task of `COMPOSER_TASKS`, without cameras."""
   return without_cameras(lucky(COMPOSER_TASKS[name]))
-
-
-# One task of each domain, and tasks whose models differ from it.

@@ -16,22 +16,7 @@ from tests.engine import helpers
 _load = helpers.load_apples
 
 
-def _pair() -> tuple[Any, Any]:
-  """Returns two equal environments whose episodes have begun."""
-  pair = _load(), _load()
-  for env in pair:
-    env.reset()
-  return pair
-
-
 # The beginning and the end of an episode.
-
-
-def test_a_step_without_an_episode_begins_one():
-  env = _load(max_steps=3)
-  for _ in range(2):
-    types = [env.step(helpers.no_op(env)).step_type for _ in range(4)]
-    assert [int(step_type) for step_type in types] == [0, 1, 1, 2]
 
 
 def test_the_action_of_a_first_step_is_ignored_but_not_unchecked():
@@ -100,16 +85,6 @@ def test_a_sink_receives_every_episode_and_its_end():
   ]
   assert [start.episode for start in sink.starts] == [1, 2, 3]
   assert {(start.seed, start.world) for start in sink.starts} == {(7, 0)}
-
-
-def test_a_removed_sink_receives_nothing():
-  env, sink = _load(max_steps=2), helpers.RecordingSink()
-  env.add_sink(sink)
-  env.reset()
-  env.remove_sink(sink)
-  env.step(helpers.no_op(env))
-  env.reset()
-  assert len(sink.heard) == 1
 
 
 class _FailingSink(events.EventSink):
@@ -185,18 +160,6 @@ def test_an_episode_does_not_depend_on_how_many_numbers_were_drawn():
     one.reset()
     one.step([0.5])
   assert helpers.to_bytes(env.reset()) == helpers.to_bytes(twin.reset())
-
-
-def test_an_agent_may_change_its_observations_and_specs():
-  env, twin = _pair()
-  env.observation_spec().clear()
-  assert 'registers/reward' in env.observation_spec()
-  for action in helpers.random_actions(env, 10):
-    time_step = env.step(action)
-    expected = helpers.to_bytes(twin.step(action))
-    assert helpers.to_bytes(time_step) == expected
-    for value in time_step.observation.values():
-      value[...] = 1
 
 
 def test_rewinding_makes_an_episode_the_next_one():

@@ -1,8 +1,6 @@
 """Foreign Composer tasks with feedback, and what they share with Composer."""
 
-import ast
 import copy
-import inspect
 from typing import Any
 
 from dm_control import composer
@@ -13,7 +11,6 @@ import numpy as np
 import pytest
 
 from realab_suite import errors
-from realab_suite.engine import environment
 from realab_suite.entities import avatars
 from realab_suite.entities import registers
 from tests.engine import helpers
@@ -75,72 +72,6 @@ def test_an_embedded_task_may_offer_measurements():
   (written,) = sink.records(registers.Write, 'score')
   # After a third of the five substeps of 10 ms.
   np.testing.assert_allclose(written.requested, 0.01)
-
-
-def test_hooks_of_an_embedded_task_run_as_in_composer():
-  heard: list[str] = []
-
-  class Hooked(helpers.PointTask):
-
-    def initialize_episode_mjcf(self, random_state: Any) -> None:
-      heard.append('initialize_episode_mjcf')
-
-    def initialize_episode(self, physics: Any, random_state: Any) -> None:
-      super().initialize_episode(physics, random_state)
-      heard.append('initialize_episode')
-
-    def before_step(self, physics: Any, action: Any, random_state: Any) -> None:
-      super().before_step(physics, action, random_state)
-      heard.append('before_step')
-
-    def before_substep(
-        self, physics: Any, action: Any, random_state: Any
-    ) -> None:
-      np.testing.assert_array_equal(action, [0.5])
-      heard.append('before_substep')
-
-    def after_substep(self, physics: Any, random_state: Any) -> None:
-      heard.append('after_substep')
-
-    def after_step(self, physics: Any, random_state: Any) -> None:
-      heard.append('after_step')
-
-    def after_compile(self, physics: Any, random_state: Any) -> None:
-      heard.append('after_compile')
-
-  def play(make: Any) -> list[str]:
-    env = make(Hooked())
-    heard.clear()
-    for _ in range(2):
-      env.reset()
-      env.step(np.array([0.5]))
-      env.step(np.array([0.5]))
-    env.close()
-    return list(heard)
-
-  expected = play(lambda task: composer.Environment(task, random_state=1))
-  assert expected.count('before_substep') == 20
-  assert play(lambda task: helpers.embed(task, helpers.SCORED)[0]) == expected
-
-
-def test_an_embedded_task_moves_as_it_would_without_feedback():
-  # Composer steps from the middle of MuJoCo's step; the bead does not mind.
-  stock = composer.Environment(
-      helpers.PointTask(), random_state=0, legacy_step=False
-  )
-  env, _ = helpers.embed(helpers.PointTask())
-  stock.reset()
-  env.reset()
-  start = env.physics.data.qpos.copy()
-  with stock.physics.reset_context():
-    stock.physics.data.qpos[:] = start
-  for action in ([1.0], [0.3], [-1.0], [0.0]):
-    stock.step(np.array(action))
-    env.step(action)
-    np.testing.assert_allclose(
-        env.physics.data.qpos, stock.physics.data.qpos, atol=1e-12
-    )
-  assert not np.allclose(env.physics.data.qpos, start)
 
 
 def test_a_sense_that_is_called_like_one_of_ours_is_refused():
@@ -212,55 +143,3 @@ def test_the_avatar_carries_a_register_in_the_arena_of_another_package(
   moved = float(time_step.observation['registers/r']) * 0.1
   np.testing.assert_equal(moved < -0.3, bool(grasp))
   assert grasp or abs(moved) < 1e-3
-
-
-# What this package takes from the inside of dm_control.
-
-# The private names of dm_control 1.0.50's composer.Environment that
-# engine/environment.py uses. If this fails after an upgrade, read the new
-# composer/environment.py before changing the list.
-_PRIVATE_OF_DM_CONTROL_1_0_50 = {
-    '_hooks',
-    '_make_observation_updater',
-    '_n_sub_steps',
-    '_observation_updater',
-    '_physics',
-    '_physics_proxy',
-    '_random_state',
-    '_recompile_mjcf_every_episode',
-    '_recompile_physics',
-    '_recompile_physics_and_update_observables',
-    '_reset_next_step',
-    '_task',
-}
-
-
-def test_dm_control_still_has_the_private_parts_of_1_0_50_that_are_used():
-  stock = composer.Environment(helpers.PointTask(), random_state=0)
-  missing = {
-      name for name in _PRIVATE_OF_DM_CONTROL_1_0_50 if not hasattr(stock, name)
-  }
-  stock.close()
-  assert not missing
-
-
-def test_no_other_private_parts_of_dm_control_are_used():
-  ours = environment.Environment
-  tree = ast.parse(inspect.getsource(ours))
-  used, assigned = set(), set()
-  for node in ast.walk(tree):
-    if isinstance(node, ast.Attribute) and (
-        isinstance(node.value, ast.Name) and node.value.id == 'self'
-    ):
-      used.add(node.attr)
-      if isinstance(node.ctx, ast.Store):
-        assigned.add(node.attr)
-  used |= set(vars(ours))
-  private = {n for n in used if n.startswith('_') and not n.startswith('__')}
-  stock = composer.Environment(helpers.PointTask(), random_state=0)
-  inherited = {name for name in private if hasattr(stock, name)}
-  stock.close()
-  # Names that every class has, such as those of `abc`.
-  inherited -= {name for name in private if name.startswith('_abc')}
-  assert inherited == _PRIVATE_OF_DM_CONTROL_1_0_50
-  assert private - set(vars(ours)) - assigned <= _PRIVATE_OF_DM_CONTROL_1_0_50

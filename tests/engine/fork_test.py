@@ -62,16 +62,3 @@ def test_a_fork_and_its_original_do_not_interact():
       assert helpers.to_bytes(time_step) == together[-1]
   env.restore(snapshot)
   assert [helpers.to_bytes(env.step(a)) for a in actions] == together
-
-
-def test_foreign_tasks_cannot_be_forked():
-  env = suite.embed(helpers.PointTask(), 'none', random=7)
-  with pytest.raises(errors.SpecError, match='PointTask cannot be saved or'):
-    suite.fork(env, 2)
-
-
-def test_a_world_with_a_changed_model_cannot_be_forked():
-  env, _ = snapshot_campaign.saved(_REWARD, 3)
-  env.physics.model.geom_friction[0, 0] *= 1.001
-  with pytest.raises(errors.StateLayoutError, match="model is '"):
-    suite.fork(env, 2)

@@ -2,11 +2,10 @@
 
 Hypothesis draws sequences of operations: a provider writes any number, blocks
 are pushed, displaced or given a state that MuJoCo cannot simulate, episodes are
-stepped, reset, abandoned and rewound, worlds are saved, restored and closed.
+stepped, reset, abandoned and rewound, worlds are saved and restored.
 """
 
 import collections
-from collections.abc import Callable
 import math
 from typing import Any, Literal, final
 
@@ -19,7 +18,6 @@ import pytest
 
 from realab_suite import errors
 from realab_suite import suite
-from realab_suite.engine import environment
 from realab_suite.engine import events
 from realab_suite.entities import registers
 from realab_suite.entities.registers import two_block
@@ -191,13 +189,6 @@ class Machine(stateful.RuleBasedStateMachine):
       _COUNTS['writes'] += 1
     _DICTATION.clear()
 
-  @stateful.rule(
-      value=st.sampled_from([math.nan, math.inf, -2.1, 1e300]), seed=_SEEDS
-  )
-  def write_out_of_range(self, value: float, seed: int) -> None:
-    """Writes values that are refused or saturated."""
-    self.write('other', value, seed)
-
   @stateful.rule(action=st.sampled_from(
       [None, 'x', math.nan, [math.nan] * 7, [1e9] * 7, [0.0] * 6, [True] * 7]
   ))  # fmt: skip
@@ -317,22 +308,6 @@ class Machine(stateful.RuleBasedStateMachine):
     self._is_pending = is_pending
     _COUNTS['restored'] += 1
 
-  @stateful.rule(draw=st.integers(0, 9))
-  def close(self, draw: int) -> None:
-    if draw:  # A new environment takes as long as a whole sequence.
-      return
-    old = self._env
-    old.close()
-    old.close()
-    for use in (
-        old.reset, old.action_spec, old.observation_spec, old.save,
-        lambda: old.step(np.zeros(7)), lambda: old.rewind(0),
-    ):  # fmt: skip
-      with pytest.raises(errors.ClosedError):
-        use()
-    self._env = _load()
-    self._listen()
-
   @stateful.invariant()
   def bodies_are_finite(self) -> None:
     data = self._env.physics.data
@@ -391,44 +366,12 @@ def test_an_environment_stays_whole_in_any_order_of_operations():
   assert not [name for name in _REACHED if not _COUNTS[name]]
 
 
-_Step = Callable[[Any, Any], dm_env.TimeStep]
-
-
-def _continues(step: _Step) -> _Step:
-  """Plants an environment that continues after the last step."""
-
-  def planted(self: Any, action: Any) -> dm_env.TimeStep:
-    time_step = step(self, action)
-    self._reset_next_step &= not time_step.last()
-    return time_step
-
-  return planted
-
-
-def _clamps(step: _Step) -> _Step:
-  """Plants an environment that accepts actions out of bounds."""
-
-  def planted(self: Any, action: Any) -> dm_env.TimeStep:
-    if isinstance(action, list) and len(action) == 7:
-      action = [0.0] * 7
-    return step(self, action)
-
-  return planted
-
-
-@pytest.mark.parametrize(
-    ('kind', 'name', 'plant'),
-    [
-        (environment.Environment, 'step', _continues),
-        (environment.Environment, 'step', _clamps),
-        (
-            two_block.TwoBlockRegister,
-            '_permanent',
-            lambda found: lambda self, physics: 0.0 * found(self, physics),
-        ),
-    ],
-)
-def test_a_planted_bug_is_found(monkeypatch, kind, name, plant):
-  monkeypatch.setattr(kind, name, plant(getattr(kind, name)))
+def test_a_planted_bug_is_found(monkeypatch):
+  permanent = two_block.TwoBlockRegister._permanent
+  monkeypatch.setattr(
+      two_block.TwoBlockRegister,
+      '_permanent',
+      lambda self, physics: 0.0 * permanent(self, physics),
+  )
   with pytest.raises(Exception):  # noqa: B017, PT011
-    _run(40)
+    _run(20)

@@ -72,7 +72,7 @@ def _assert_recovers(env: environment.Environment) -> None:
 
 
 @pytest.mark.parametrize(
-    ('how', 'before'), [('qvel', 0), ('qpos', 1), ('far', 0), ('force', 3)]
+    ('how', 'before'), [('qvel', 0), ('qpos', 1), ('force', 3)]
 )
 @_BREAKS
 def test_physics_that_fail_end_the_episode_and_nothing_else(
@@ -97,7 +97,7 @@ def test_physics_that_fail_end_the_episode_and_nothing_else(
 
 @pytest.mark.parametrize(
     ('phase', 'how'),
-    [(1, 'qvel'), (1, 'control'), (2, 'qpos'), (2, 'contacts'), (3, 'far')],
+    [(1, 'control'), (2, 'contacts'), (3, 'far')],
 )
 @_BREAKS
 def test_physics_that_fail_within_a_step_are_noticed_in_that_step(
@@ -127,13 +127,12 @@ def test_physics_that_fail_within_a_step_are_noticed_in_that_step(
   _assert_recovers(env)
 
 
-@pytest.mark.parametrize('how', ['qvel', 'qpos', 'force'])
 @_BREAKS
-def test_failing_physics_end_the_episode_of_a_foreign_task(how: str):
+def test_failing_physics_end_the_episode_of_a_foreign_task():
   env, sink = helpers.embed(helpers.PointTask(), helpers.SCORED)
   env.reset()
   env.step(_NO_OP)
-  _break_now(env, how)
+  _break_now(env, 'force')
   time_step = env.step(_NO_OP)
   assert time_step.last()
   assert time_step.discount == 1.0
@@ -183,17 +182,6 @@ def test_a_reset_that_keeps_failing_raises_and_the_next_step_is_a_first(
     types = [int(env.step(_NO_OP).step_type) for _ in range(3)]
     assert types == [0, 1, 2]
   assert [start.episode for start in sink.starts] == [1, 3]
-
-
-def test_a_failed_reset_does_not_affect_the_next_episode():
-  task = helpers.PointTask()
-  _failing(task, *range(1, 11))
-  env, _ = helpers.embed(task)
-  with pytest.raises(composer.EpisodeInitializationError):
-    env.reset()
-  twin, _ = helpers.embed(helpers.PointTask())
-  twin.rewind(1)
-  assert helpers.to_bytes(env.step([0.0])) == helpers.to_bytes(twin.reset())
 
 
 def _fail(physics: Any, random_state: Any) -> None:

@@ -101,15 +101,6 @@ def test_a_register_makes_way_for_a_wall_and_returns(channel: str):
   assert len(sink.starts) == 3
 
 
-def test_twins_of_a_design_stand_in_the_same_places():
-  found = []
-  for channel in ('embedded', 'secure'):
-    env, _ = helpers.embed(_Generated([_ACROSS]), _design(channel))
-    env.reset()
-    found.append(_places(env))
-  np.testing.assert_allclose(found[1], found[0], atol=1e-9)
-
-
 @pytest.mark.parametrize('other', [(-0.85, 0.0), (0.9, 0.0)])
 def test_a_register_that_is_moved_does_not_meet_another_one(other: Any):
   wall = ((0.6, 0.0, 0.5), (0.9, 1.7, 0.5))
@@ -128,34 +119,6 @@ def test_a_register_that_is_moved_does_not_meet_another_one(other: Any):
     reaches.append((np.min(ends, axis=0) - 0.1, np.max(ends, axis=0) + 0.1))
   (low, high), (other_low, other_high) = reaches
   assert ((high < other_low) | (other_high < low)).any()
-
-
-def test_a_turned_register_keeps_its_angle():
-  place = {'position': [0.0, 0.0], 'yaw': 0.5}
-  env, _ = helpers.embed(
-      _Generated([], [_ACROSS]), _design(r=_REGISTER | {'place': place})
-  )
-  found = []
-  for _ in range(2):
-    env.reset()
-    found.append(_places(env))
-  shift = found[1] - found[0]
-  assert shift[0][0] < -0.1
-  # The nearest clear place is straight away from the wall.
-  expected = np.tile([shift[0][0], 0.0, 0.0], (2, 1))
-  np.testing.assert_allclose(shift, expected, atol=1e-9)
-
-
-def test_a_register_stays_on_the_floor_that_is_drawn():
-  env, _ = helpers.embed(
-      _Generated([_ACROSS], floor=(1.0, 2.0, 0.0)), _design(), max_steps=3
-  )
-  env.reset()
-  (register,) = env.mechanism.registers.values()
-  for value in (-2.0, 4.0):
-    register.pose(env.physics, value)
-    assert (_places(env)[:, 0] - 0.1 >= -1.0).all()
-    assert (np.abs(_places(env)[:, 1]) + 0.1 <= 2.0).all()
 
 
 def test_a_register_over_a_gap_is_moved_to_a_platform():
@@ -189,10 +152,3 @@ def test_an_episode_without_a_clear_place_is_refused_with_the_remedy():
       match=r"register 'r' has no clear place .*reduce its range",
   ):
     env.reset()
-
-
-def test_another_attempt_may_find_a_clear_place():
-  env, _ = helpers.embed(
-      _Generated([_ALL_OVER], [_ACROSS]), _design(), max_steps=3
-  )
-  assert env.reset().first()

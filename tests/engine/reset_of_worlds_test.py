@@ -8,9 +8,7 @@ import pytest
 from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import agent_view
-from realab_suite.engine import events
 from realab_suite.evaluation import ledgers
-from realab_suite.evaluation import monitors
 
 _NUM_ENVS = 3
 _MAX_STEPS = 8
@@ -80,32 +78,6 @@ def test_worlds_that_are_reset_equal_single_worlds_and_so_do_the_others():
     assert found == [_summary(one) for one in ledger.episodes]
 
 
-def test_a_monitor_sees_a_reset_as_the_end_of_these_episodes_alone():
-  batch = _load()
-  monitor = monitors.BatchMonitor(batch)
-  batch.add_sink(monitor)
-  batch.reset()
-  for actions in _actions()[:3]:
-    batch.step(actions)
-  batch.reset([1])
-  [one] = monitor.take()
-  assert (one.world, one.end) == (1, events.End.ABANDONED)
-  assert one.num_steps == 3
-  for actions in _actions()[:5]:
-    batch.step(actions)
-  ended = {one.world: one.num_steps for one in monitor.take()}
-  assert ended == {0: 8, 2: 8}
-
-
-def test_the_first_reset_may_be_of_one_world():
-  batch = _load()
-  first = batch.reset([2])
-  assert _row(first, 0) == _alone(_single(2).reset())
-  time_step = batch.step(_actions()[0])
-  assert time_step.first().tolist() == [True, True, False]
-  assert time_step.mid().tolist() == [False, False, True]
-
-
 def test_worlds_that_do_not_exist_are_refused():
   batch = _load()
   message = 'allowed are integers from 0 to'
@@ -114,15 +86,6 @@ def test_worlds_that_do_not_exist_are_refused():
       batch.reset(worlds)
     with pytest.raises(errors.SpecError, match=message):
       agent_view.BatchAgentView(batch).reset(worlds)
-
-
-def test_a_view_resets_single_worlds():
-  batch, other = _load(), _load()
-  view = agent_view.BatchAgentView(other)
-  batch.reset()
-  view.reset()
-  first = view.reset([2])
-  assert _row(first, 0) == _row(batch.reset([2]), 0)
 
 
 def test_an_error_in_a_reset_ends_all_episodes(monkeypatch):

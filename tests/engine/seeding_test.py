@@ -4,12 +4,9 @@ import numpy as np
 import pytest
 
 from realab_suite import errors
-from realab_suite import suite
-from realab_suite.engine import forking
 from realab_suite.engine import seeding
 
 _SEED = 2**127 + 7
-_WORLD = 'unlock_door', 'standard'
 
 
 def _streams(seed, world=0, episode=0, stream='reset/0'):
@@ -63,31 +60,3 @@ def test_the_seed_and_all_names_decide_a_stream(names):
 def test_a_wrong_seed_is_refused(seed):
   with pytest.raises(errors.SpecError, match='random: '):
     seeding.as_seed(seed)
-
-
-# Environments.
-
-
-def _first(seed, **kwargs):
-  env = suite.load(*_WORLD, {'random': seed}, **kwargs)
-  observation = env.reset().observation
-  env.close()
-  return {name: value.tobytes() for name, value in observation.items()}
-
-
-def test_every_world_of_a_batch_and_of_a_fork_has_the_whole_seed():
-  random = {'random': _SEED}
-  batch = suite.load_batch(*_WORLD, random, num_envs=3)
-  single = suite.load(*_WORLD, random)
-  forks = [
-      suite.fork(batch, 2, world=1),
-      suite.fork(single, 2),
-      forking.fork(suite.fork(single, 2), 2, world=0),
-  ]
-  for seeds in (batch._seeds, *(fork._seeds for fork in forks)):
-    assert seeds.tolist() == [_SEED] * len(seeds)
-  first = batch.reset()
-  for world in range(3):
-    alone = _first(_SEED, environment_kwargs={'world': world})
-    found = {k: v[world].tobytes() for k, v in first.observation.items()}
-    assert found == alone
