@@ -81,10 +81,12 @@ _FAIL = (
 )
 
 
-def _pytest(folder: pathlib.Path, *arguments: str) -> tuple[int, str, str]:
-  (folder / 'conftest.py').write_text(_CONFTEST)
-  (folder / 'planted_test.py').write_text(_TESTS)
-  (folder / 'pytest.ini').write_text(
+def test_unannounced_warnings_fail_their_test_and_errors_at_exit_the_run(
+    tmp_path,
+):
+  (tmp_path / 'conftest.py').write_text(_CONFTEST)
+  (tmp_path / 'planted_test.py').write_text(_TESTS)
+  (tmp_path / 'pytest.ini').write_text(
       '[pytest]\nfilterwarnings = error\npython_files = *_test.py\n'
       'addopts = -p no:cacheprovider -p no:randomly\n'
   )
@@ -93,20 +95,20 @@ def _pytest(folder: pathlib.Path, *arguments: str) -> tuple[int, str, str]:
       for name, value in os.environ.items()
       if not name.startswith('PYTEST_')
   }
-  ran = subprocess.run(
-      [sys.executable, '-m', 'pytest', '-v', *arguments, str(folder)],
-      cwd=folder,
-      env={**inherited, 'PYTHONPATH': str(_ROOT)},
-      capture_output=True,
-      text=True,
-      timeout=patience.SECONDS,
-      check=False,
-  )
-  return ran.returncode, ran.stdout, ran.stderr
 
+  def run(only: str) -> tuple[int, str, str]:
+    ran = subprocess.run(
+        [sys.executable, '-m', 'pytest', '-v', '-k', only, str(tmp_path)],
+        cwd=tmp_path,
+        env={**inherited, 'PYTHONPATH': str(_ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=patience.SECONDS,
+        check=False,
+    )
+    return ran.returncode, ran.stdout, ran.stderr
 
-def test_unannounced_warnings_fail_their_test(tmp_path):
-  status, out, _ = _pytest(tmp_path, '-k', 'not exit')
+  status, out, _ = run('not exit')
   assert status == 1
   for name in _FAIL:
     assert f'{name} FAILED' in out, out
@@ -115,31 +117,15 @@ def test_unannounced_warnings_fail_their_test(tmp_path):
   assert 'test_bad_fixture ERROR' in out, out
   # The errors are those of the fixture alone.
   assert '5 failed, 3 passed, 1 deselected, 1 error' in out, out
-
-
-def test_an_error_at_exit_changes_the_exit_status(tmp_path):
-  status, out, err = _pytest(tmp_path, '-k', 'exit')
-  assert '1 passed' in out
-  assert status == 1
+  # Tests that pass, with and without an error at exit.
+  status, out, _ = run('quiet or announced_physics')
+  assert (status, '2 passed' in out) == (0, True)
+  status, out, err = run('exit')
+  assert (status, '1 passed' in out) == (1, True)
   assert 'ZeroDivisionError' in err
-
-
-def test_passing_tests_exit_with_status_0(tmp_path):
-  status, out, _ = _pytest(tmp_path, '-k', 'quiet or announced_physics')
-  assert '2 passed' in out
-  assert status == 0
 
 
 @pytest.mark.parametrize('name', gate.MESSAGES)
 def test_every_warning_of_mujoco_has_a_name(name):
   kind = getattr(mujoco.mjtWarning, f'mjWARN_{name}')
   assert gate.name_of(mujoco.mju_warningText(int(kind), 3)) == name
-
-
-def test_all_warnings_of_mujoco_are_named():
-  kinds = [
-      name.removeprefix('mjWARN_') for name in mujoco.mjtWarning.__members__
-  ]
-  assert sorted(gate.MESSAGES) == sorted(
-      name for name in kinds if name != 'mjNWARNING'
-  )

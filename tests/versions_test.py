@@ -44,8 +44,6 @@ def _lines(text):
     [
         {},
         {'dm_control': '1.0.51'},
-        {'dm_control': '1.1'},
-        {'mujoco': '3.99.1'},
         {'mujoco': '3.18.0.dev1'},
     ],
 )
@@ -58,7 +56,6 @@ def test_a_pair_inside_the_ranges_is_accepted(monkeypatch, changes):
     ('changes', 'found'),
     [
         ({'mujoco': '4.0.0'}, 'dm-control 1.0.50 and mujoco 4.0.0'),
-        ({'mujoco': '3.9.0'}, 'dm-control 1.0.50 and mujoco 3.9.0'),
         ({'dm_control': '2.0'}, 'dm-control 2.0 and mujoco 3.17.0'),
         ({'mujoco': None}, 'dm-control 1.0.50 and mujoco missing'),
         ({'mujoco': 'unknown'}, 'dm-control 1.0.50 and mujoco unknown'),
@@ -95,16 +92,6 @@ def test_every_folder_with_code_is_in_the_list_of_packages():
       for folder in folders
   ]
   assert sorted(names) == _lines(_setup_cfg()['options']['packages'])
-
-
-def test_every_module_lies_in_a_package():
-  stray = [
-      path
-      for top in ('realab_suite', 'configs')
-      for path in (_ROOT / top).rglob('*.py')
-      if not (path.parent / '__init__.py').exists()
-  ]
-  assert not stray
 
 
 def test_every_data_file_is_shipped():
