@@ -140,7 +140,7 @@ _ROUND = {
 
 @pytest.mark.parametrize(
     ('geom', 'turned'),
-    zip(_ROUND.values(), (0.0, 0.5), strict=True),
+    [(_ROUND['ball'], 0.0), (_ROUND['column'], 0.5)],
     ids=_ROUND,
 )
 def test_round_things_beside_a_register_do_not_obstruct_it(geom, turned):
