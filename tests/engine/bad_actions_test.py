@@ -15,10 +15,6 @@ from tests.engine import helpers
 
 _NAN, _INF = float('nan'), float('inf')
 _INDEX = ('action_set={name: dmlab_like, version: 1}',)
-_QUERY = (
-    'registers.query={kind: two_block, role: query, place: station_3,'
-    ' range: [0, 13]}',
-)
 
 
 def _load(overrides: tuple[str, ...] = ()) -> Any:
@@ -109,41 +105,6 @@ def test_an_action_is_neither_kept_nor_changed(pair: Any):
   action[:] = _NAN  # The caller may write to its own array.
   second = env.step(np.zeros(6))
   assert helpers.to_bytes(second) == helpers.to_bytes(twin.step(np.zeros(6)))
-
-
-@pytest.mark.parametrize(
-    ('overrides', 'bad', 'good'),
-    [
-        (
-            _INDEX,
-            {
-                'action (dmlab_like/v1) = 14.0 outside [0, 13]': 14,
-                'action (dmlab_like/v1) = -1.0 outside [0, 13]': -1,
-                'dtype float64': 1.0,
-                'shape (1,), expected ()': [1],
-            },
-            (0, np.int64(13), np.uint8(5), np.array(3)),
-        ),
-        # No provider takes this query for an index, so any number is accepted.
-        (
-            (*_INDEX, *_QUERY),
-            {
-                'action[0] (query/query) = 14.0 outside [0, 13]': [14.0, 0],
-                'action[1] (dmlab_like/v1) is nan': [3.0, _NAN],
-                'shape (1,), expected (2,)': [3.0],
-            },
-            ([3.5, 13],),
-        ),
-    ],
-    ids=['index', 'query and index'],
-)
-def test_bad_indices_and_queries_are_rejected(overrides, bad, good):
-  env = _load(overrides)
-  env.reset()
-  for message, action in bad.items():
-    assert message in _refuse(env, action)
-  for action in good:
-    assert env.step(action).mid()
 
 
 def test_an_index_applies_its_row_of_the_action_set(pair: Any):

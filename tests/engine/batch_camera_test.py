@@ -11,7 +11,7 @@ from realab_suite.engine import single_physics
 
 _NUM_ENVS = 3
 _SIZE = (24, 40)
-_MAX_STEPS = 4
+_MAX_STEPS = 2
 
 
 def _load(sleep=False, size=_SIZE):

@@ -12,7 +12,6 @@ from realab_suite.entities import registers
 from realab_suite.evaluation import ledgers
 from realab_suite.evaluation import monitors
 from realab_suite.tasks import collect_apples
-from tests.engine import helpers
 from tests.evaluation import streams
 
 _NUM_ENVS = 3
@@ -128,47 +127,6 @@ def _check_parts(episode: ledgers.EpisodeLedger, is_obstructed: bool) -> None:
     if read.register == 'reward' and read.step >= _STEPS[-1]:
       assert read.permanent == pytest.approx(2.0, abs=0.1)
     assert write.requested == write.applied
-
-
-# Blocks pass below the middle of a ball, and past a column, within the box
-# around it.
-_ROUND = {
-    'ball': {'type': 'sphere', 'size': (0.8,), 'pos': (1.7, 0.95, 0.85)},
-    'column': {'type': 'cylinder', 'size': (0.8, 0.3), 'pos': (2.2, 1.0, 0.3)},
-}
-
-
-@pytest.mark.parametrize(
-    ('geom', 'turned'),
-    [(_ROUND['ball'], 0.0), (_ROUND['column'], 0.5)],
-    ids=_ROUND,
-)
-def test_round_things_beside_a_register_do_not_obstruct_it(geom, turned):
-  task = helpers.PointTask()
-  task.root_entity.mjcf_model.worldbody.add('geom', name='thing', **geom)
-  start = np.array([0.5, 0.35])
-  if turned:  # The whole arrangement is turned about the origin.
-    cos, sin = np.cos(turned), np.sin(turned)
-    turn = np.array([[cos, -sin], [sin, cos]])
-    start = turn @ start
-    thing = task.root_entity.mjcf_model.find('geom', 'thing')
-    thing.pos = [*turn @ thing.pos[:2], thing.pos[2]]
-  reward = {
-      'kind': 'block_position',
-      'role': 'feedback',
-      'initial': 0,
-      'place': {'position': start.tolist(), 'yaw': turned},
-      'range': [0, 10],
-  }
-  design = {'schema': 1, 'name': 'round', 'registers': {'reward': reward}}
-  env = suite.embed(task, design, random=0)
-  env.reset()
-  register = env.mechanism.registers['reward']
-  for value in np.linspace(0.0, 10.0, 21):
-    register.write(env.physics, value)
-    assert float(register.obstruction(env.physics)) == 0.0
-    assert float(register.read(env.physics)) == pytest.approx(value, abs=1e-9)
-    register.pose(env.physics, 0.0)
 
 
 def test_an_obstructed_block_leaves_the_wall_slowly():

