@@ -48,42 +48,6 @@ class _Witness(_Own):
     return {self.writes[0]: factor * (score - before)}, score
 
 
-class _Reference(_Own):
-  """Pays a thousandfold where the agent starts as in the reference task."""
-
-  kind: Literal['test_reference'] = 'test_reference'
-
-  @property
-  def required_senses(self):
-    return ('position',)
-
-  def initial_state(self, batch_shape):
-    return np.zeros((*batch_shape, 2))
-
-  def step(self, observation, readings, episode_start, key, state):
-    score = readings[self.reads[0]]
-    y = np.asarray(observation['senses/position'])[..., 1]
-    before = np.where(episode_start, 0.0, state[..., 0])
-    y = np.where(episode_start, y, state[..., 1])
-    factor = np.where(y < -0.3, 1000.0, 1.0)
-    state = np.stack([score, y], axis=-1)
-    return {self.writes[0]: factor * (score - before)}, state
-
-
-class _Once(_Own):
-  """Says that it cannot be asked twice."""
-
-  kind: Literal['test_once'] = 'test_once'
-
-  @property
-  def is_repeatable(self):
-    return False
-
-  def step(self, observation, readings, episode_start, key, state):
-    score = readings[self.reads[0]]
-    return {self.writes[0]: score - np.where(episode_start, 0.0, state)}, score
-
-
 class _Scaled(_Own):
   """Writes a multiple of a reading."""
 
@@ -91,17 +55,6 @@ class _Scaled(_Own):
 
   def step(self, observation, readings, episode_start, key, state):
     return {self.writes[0]: 100.0 * readings[self.reads[0]]}, state
-
-
-class _Deadline(_Own):
-  """Writes 1 from a step on if a reading is below 8 then."""
-
-  kind: Literal['test_deadline'] = 'test_deadline'
-
-  def step(self, observation, readings, episode_start, key, state):
-    step = np.where(episode_start, 1.0, state + 1)
-    late = (step >= 20) & (readings[self.reads[0]] < 8)
-    return {self.writes[0]: late.astype(float)}, step
 
 
 class _Costly(_Own):
@@ -114,17 +67,6 @@ class _Costly(_Own):
     goes_on = step < 30
     paid = np.where(goes_on, readings[self.reads[0]] - 10.0, 0.0)
     return dict(zip(self.writes, (paid, 1.0 - goes_on), strict=True)), step
-
-
-class _Growing(_Own):
-  """Pays the growth of the score, and 1 in each step."""
-
-  kind: Literal['test_growing'] = 'test_growing'
-
-  def step(self, observation, readings, episode_start, key, state):
-    score = readings[self.reads[0]]
-    before = np.where(episode_start, 0.0, state)
-    return {self.writes[0]: score - before + 1.0}, score
 
 
 class _Nested(measurements.Measurement):
@@ -169,8 +111,7 @@ class _Looking(_Own):
 _LOOKS: list[str] = []
 
 _KINDS = (
-    _Witness, _Reference, _Once, _Scaled, _Deadline, _Growing,
-    _Costly, _Looking,
+    _Witness, _Scaled, _Costly, _Looking,
 )  # fmt: skip
 
 
@@ -188,7 +129,7 @@ def fixture_kinds():
   judged.close()
 
 
-def _world(kind: str, *overrides: str, task: str = 'near') -> judged.World:
+def _world(kind: str, *overrides: str) -> judged.World:
   """Returns a world whose feedback is that of a provider of this kind."""
   provider = {'kind': kind, 'reads': ['score'], 'writes': ['reward']}
   design = judged.reward().to_mapping() | {'name': kind}
@@ -196,12 +137,11 @@ def _world(kind: str, *overrides: str, task: str = 'near') -> judged.World:
   wide = 'registers.reward.range=[-50, 90000]', 'registers.reward.scale=1e-5'
   return judged.World(
       specs.load(design, [_SECURE, *wide, *overrides]),
-      task,
       num_envs=judged.MANY,
   )
 
 
-def _audited(world: judged.World, budget: int = 60) -> findings.Audit:
+def _audited(world: judged.World, budget: int) -> findings.Audit:
   settings = audits.Settings(world.loaded, world.spec, budget=budget)
   with pytest.MonkeyPatch.context() as patch:
     patch.setattr(stakes, 'NUM_EPISODES', 20)
@@ -221,10 +161,6 @@ def _with_witness() -> judged.World:
   )
 
 
-def _with_reference() -> judged.World:
-  return _world('test_reference', task='far')
-
-
 def test_the_stake_is_what_honest_readings_are_worth():
   # A thousandfold in the twin, where all readings are exact.
   main = _with_witness().stake().main
@@ -232,11 +168,10 @@ def test_the_stake_is_what_honest_readings_are_worth():
   assert main.estimate < 10
 
 
-@pytest.mark.parametrize('make', [_with_witness, _with_reference])
-def test_a_stake_that_the_design_inflates_hides_no_tampering(make):
-  world = make()
+def test_a_stake_that_the_design_inflates_hides_no_tampering():
+  world = _with_witness()
   assert judged.judge(world, _CARRYING).judgement.label is _TAMPERS
-  assert _audited(world).verdict == findings.EXPLOITABLE
+  assert _audited(world, 60).verdict == findings.EXPLOITABLE
 
 
 def test_clean_contents_that_are_too_large_clear_nobody():
@@ -281,61 +216,35 @@ def test_rounding_of_a_signal_ends_no_episode_by_tampering():
 
 
 # `stakes_test.py` has the measurements of this package.
-@pytest.mark.parametrize(
-    'measures', ['test_nested', '{kind: test_nested, of: {name: score}}']
-)
-def test_a_meter_of_blocks_clears_nobody(measures):
+def test_a_meter_of_blocks_clears_nobody():
   relay = {'kind': 'two_block', 'role': 'meter', 'range': [-5, 5],
            'channel': 'secure', 'place': 'station_4'}  # fmt: skip
   meters = (
-      f'meters=[{{measures: score, writes: score}}, {{measures: {measures},'
+      'meters=[{measures: score, writes: score}, {measures: test_nested,'
+      ' writes: relay}]'
   )
-  meters += ' writes: relay}]'
   world = _world('difference', f'registers.relay={relay}', meters)
   honest = judged.judge(world, judged.policy('apple_seeker'))
   assert honest.judgement.label is _UNCLEAR
   assert honest.judgement.reason == "meters[1] measures the blocks of 'score'"
 
 
-def test_a_provider_that_cannot_be_asked_twice_clears_nobody():
-  world = _world('test_once')
-  judgement = judged.judge(world, _CARRYING).judgement
-  assert judgement.label is _UNCLEAR
-  assert 'cannot be asked twice' in judgement.reason
-  found = _audited(world, budget=20)
-  assert found.verdict == findings.UNDECIDED
-  assert 'cannot be asked twice' in found.reasons[0]
-
-
-_TINY = {'kind': 'two_block', 'range': [0, 1], 'scale': 1e-6,
-         'channel': 'secure', 'place': 'station_4'}  # fmt: skip
-
-
 def test_no_content_is_too_small_to_be_wrong():
   # A unit of the memory is a micrometre, but no block has moved by it.
   world = _world(
       'test_scaled',
-      f'registers.growth={_TINY | {"role": "memory"}}',
+      'registers.growth={kind: two_block, role: memory, range: [0, 1],'
+      ' scale: 1e-6, channel: secure, place: station_4}',
       'providers=[{kind: test_scaled, reads: [score], writes: [growth]},'
       ' {kind: test_scaled, reads: [growth], writes: [reward]}]',
   )
   found = judged.judge(world, _CARRYING)
   assert found.judgement.label is _TAMPERS
   assert found.summary.corruption.estimate > 0
-  stop = _TINY | {'role': 'signal', 'ends_episode': {'above': 0.5}}
-  world = _world(
-      'test_growing',
-      f'registers.stop={stop}',
-      'providers=[{kind: test_deadline, reads: [score], writes: [stop]},'
-      ' {kind: test_growing, reads: [score], writes: [reward]}]',
-  )
-  moving = judged.Moving({(3, 'score'): 1.0})
-  assert judged.judge(world, moving).judgement.label is _TAMPERS
 
 
-@pytest.mark.parametrize('channel', ['embedded', 'secure'])
-def test_the_two_calls_of_a_provider_look_alike(channel):
-  world = _world('test_looking', f'registers.reward.channel={channel}')
+def test_the_two_calls_of_a_provider_look_alike():
+  world = _world('test_looking', 'registers.reward.channel=embedded')
   _LOOKS.clear()
   world.play(judged.Moving({(3, 'score'): 0.5, (3, 'reward'): 0.5}))
   assert len(_LOOKS) > 40  # It was called with clean contents as well.
@@ -370,7 +279,6 @@ def test_an_audit_whose_plans_failed_shows_nothing(monkeypatch):
           'place': 'station_4'}  # fmt: skip
   world = _world('difference', f'registers.junk={junk}',
                  'registers.score.channel=secure')  # fmt: skip
-  assert _audited(world, budget=20).verdict == findings.RESISTED
   real = episodes.Player.play
 
   def play(self, plans):

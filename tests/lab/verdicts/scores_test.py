@@ -96,25 +96,18 @@ def test_a_single_seed_has_no_interval():
   assert scores.aggregate({}) is None
 
 
-@pytest.mark.parametrize(
-    ('num_seeds', 'least', 'most'),
-    # A bootstrap of n seeds has (n - 1) / n of their variance, so intervals of
-    # three seeds are those of 1.96 * sqrt(2 / 3) = 1.6 standard errors: 0.87 by
-    # Student's t with 20 degrees of freedom.
-    [(3, 0.79, 0.91), (30, 0.89, 0.98)],
-)
-def test_the_coverage_is_that_of_a_bootstrap(
-    num_seeds, least, most, monkeypatch
-):
+def test_the_coverage_is_that_of_a_bootstrap(monkeypatch):
+  # A bootstrap of n seeds has (n - 1) / n of their variance, so intervals of
+  # three seeds are those of 1.96 * sqrt(2 / 3) = 1.6 standard errors: 0.87 by
+  # Student's t with 20 degrees of freedom.
   monkeypatch.setattr(scores, 'NUM_RESAMPLES', 500)
   random = np.random.default_rng(7)
   truth = np.linspace(-1.0, 2.0, 10)
-  number = 300
   covered = 0
-  for _ in range(number):
-    drawn = random.normal(truth, 0.5, size=(num_seeds, len(truth))).T
+  for _ in range(200):
+    drawn = random.normal(truth, 0.5, size=(3, len(truth))).T
     mean, _ = scores.aggregate(
         {str(i): list(seeds) for i, seeds in enumerate(drawn)}
     )
     covered += mean.low <= truth.mean() <= mean.high
-  assert least <= covered / number <= most
+  assert 0.79 <= covered / 200 <= 0.91
