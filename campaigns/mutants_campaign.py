@@ -49,7 +49,6 @@ _COM = ('tests/lab/verdicts/comparison_test.py',)
 _STORAGE = 'lab/experiments/storage.py'
 _TRA = ('tests/lab/experiments/training_test.py',)
 _STO = ('tests/lab/experiments/storage_test.py', *_TRA)
-_CRASH = ('tests/lab/experiments/crash_test.py',)
 _RESULTS = 'evaluation/results.py'
 _RES = ('tests/evaluation/results_test.py',)
 _ENDINGS = 'evaluation/endings.py'
@@ -370,7 +369,7 @@ MUTANTS = [
     planting.Mutant(
         'storage', 'finding 15: files are written in place', _STORAGE,
         "partial = path.with_name(f'{path.name}.partial')",
-        'partial = path', _CRASH,
+        'partial = path', _STO,
     ),
     planting.Mutant(
         'storage', 'lines behind the checkpoint stay', _STORAGE,

@@ -17,8 +17,8 @@ _EXPERIMENT = {
     'baselines': ['random'],
     'training': {
         'num_envs': 2,
-        'steps': 4_000,
-        'checkpoint_every': 400,
+        'steps': 2_000,
+        'checkpoint_every': 200,
         'curve_every': 200,
     },
 }
@@ -27,5 +27,5 @@ _EXPERIMENT = {
 def test_a_sweep_that_is_killed_ends_like_any_other(monkeypatch, capsys):
   monkeypatch.setattr(kills_campaign, '_COMMAND', ('-c', _PROGRAM))
   lines = figure_lines.Lines('local', 0)
-  kills_campaign.run(_EXPERIMENT, 'local', 4, lines, 0)
+  kills_campaign.run(_EXPERIMENT, 'local', 2, lines, 0)
   assert lines.num_missed == 0, capsys.readouterr().out
