@@ -28,7 +28,12 @@ def test_an_engine_that_is_not_installed_says_what_to_install(monkeypatch):
 
 
 def _command(status):
-  return [sys.executable, '-c', f'print("said"); raise SystemExit({status})']
+  # A command ends with the process that runs it, whose number it gets.
+  text = f'import sys; print(sys.argv[1:]); raise SystemExit({status})'
+  return [sys.executable, '-c', text]
+
+
+_SAID = f"['--parent={os.getpid()}']\n"
 
 
 def _wait(engine, task):
@@ -42,17 +47,15 @@ def _wait(engine, task):
   return statuses[-1]
 
 
-def test_the_local_engine_returns_the_exit_status(tmp_path):
+def test_the_local_engine_returns_the_exit_status_and_stops_commands(
+    tmp_path, monkeypatch
+):
+  monkeypatch.setattr(engines, '_PATIENCE', patience.SECONDS)
   engine = engines.Local(1)
   log = tmp_path / 'log'
   for status in (0, 3):
     assert _wait(engine, engine.start(_command(status), log)) == status
-  assert log.read_text() == 'said\nsaid\n'
-
-
-def test_the_local_engine_stops_running_commands(monkeypatch):
-  monkeypatch.setattr(engines, '_PATIENCE', patience.SECONDS)
-  engine = engines.Local(1)
+  assert log.read_text() == 2 * _SAID
   command = [sys.executable, '-c', 'import time; time.sleep(1e6)']
   task = engine.start(command, pathlib.Path(os.devnull))
   assert engine.poll(task) is None
@@ -107,54 +110,35 @@ def test_a_cluster_runs_the_same_commands(tmp_path, monkeypatch, name):
   engine = engines.ENGINES[name](1)
   log = tmp_path / 'log'
   assert _wait(engine, engine.start(_command(3), log)) == 3
-  assert log.read_text() == 'said\n'
+  assert log.read_text() == _SAID
 
 
-def test_a_job_of_slurm_that_ended_without_a_result_is_lost(monkeypatch):
-  fake = types.ModuleType('submitit')
-  monkeypatch.setitem(sys.modules, 'submitit', fake)
-  monkeypatch.setattr('importlib.util.find_spec', lambda name: fake)
-
-  def fail():
-    raise RuntimeError('Job 7 (task: 0)\nhas not produced any output')
-
-  task = types.SimpleNamespace(done=lambda: False, result=fail)
-  engine = engines.Submitit(1)
-  assert engine.poll(task) is None
-  task.done = lambda: True
-  with pytest.raises(errors.ResultsError, match=r'=submitit: .*Job 7'):
-    engine.poll(task)
-
-
-def test_a_job_that_slurm_no_longer_has_does_not_keep_others_alive(monkeypatch):
+def test_a_job_that_slurm_lost_or_no_longer_has(monkeypatch):
   fake = types.ModuleType('submitit')
   monkeypatch.setitem(sys.modules, 'submitit', fake)
   monkeypatch.setattr('importlib.util.find_spec', lambda name: fake)
   cancelled = []
+
+  def fail():
+    raise RuntimeError('Job 7 (task: 0)\nhas not produced any output')
 
   def cancel(check=True):
     cancelled.append(check)
     if check:
       raise subprocess.CalledProcessError(1, 'scancel')
 
-  task = types.SimpleNamespace(cancel=cancel)
-  engines.Submitit(1).stop([task, task])
+  task = types.SimpleNamespace(
+      done=lambda: bool(cancelled), result=fail, cancel=cancel
+  )
+  engine = engines.Submitit(1)
+  assert engine.poll(task) is None
+  engine.stop([task, task])
   assert cancelled == [False, False]
+  with pytest.raises(errors.ResultsError, match=r'=submitit: .*Job 7'):
+    engine.poll(task)
 
 
-@pytest.mark.parametrize('name', ['Local', 'execute'])
-def test_a_command_ends_with_the_process_that_runs_it(tmp_path, name):
-  log = tmp_path / 'log'
-  command = [sys.executable, '-c', 'import sys; print(sys.argv[1:])']
-  if name == 'Local':
-    engine = engines.Local(1)
-    _wait(engine, engine.start(command, log))
-  else:
-    engines.execute(command, str(log), str(tmp_path))
-  assert log.read_text().strip() == f"['--parent={os.getpid()}']"
-
-
-def test_an_error_of_a_cluster_is_one_line(tmp_path, monkeypatch):
+def test_an_error_of_ray_is_one_line(tmp_path, monkeypatch):
   fake = _FakeRay('ray')
 
   def fail(task):

@@ -12,9 +12,7 @@ from realab_suite.lab.experiments import replays
 from realab_suite.lab.experiments import sweep_results
 from realab_suite.lab.experiments import training
 from realab_suite.lab.verdicts import judging
-from realab_suite.launchers import compare
 from tests.lab.experiments import fake_learner
-from tests.launchers import in_process
 
 _SENSES = ('ray_distances', 'ray_classes', 'velocity', 'position', 'heading',
            'holding')  # fmt: skip
@@ -68,43 +66,26 @@ def test_arguments_reach_training_evaluation_baselines_and_replays(
     tmp_path, monkeypatch
 ):
   monkeypatch.setattr(training, 'make_learner', fake_learner.make)
-  real, num_loaded = suite.load_batch, []
-
-  def load_batch(*arguments, **options):
-    batch = real(*arguments, **options)
-    assert batch.original.senses == _SENSES
-    assert batch.task.camera_size == (12, 16)
-    assert batch.original.max_steps == 8
-    num_loaded.append(batch.num_envs)
-    return batch
-
-  planned = _plan(_SENSES, evaluation={'episodes': 2})
-  options = training.Options(lambda line: None)
-  with mock.patch.object(suite, 'load_batch', load_batch):
-    paths = [training.run(job, tmp_path, options) for job in planned]
-  # A baseline; training and evaluation of a learner.
-  assert len(num_loaded) == 3
-  for job, path in zip(planned, paths, strict=True):
-    env = _replay(job, path)
-    assert (env.senses, env.task.camera_size) == (_SENSES, (12, 16))
-
-
-def test_arguments_of_training_apply_in_training_only(tmp_path, monkeypatch):
-  monkeypatch.setattr(training, 'make_learner', fake_learner.make)
+  # This one applies in training only.
   more = {**_EXPERIMENT['training'], 'task_kwargs': {'camera_size': [8, 8]}}
   real, sizes = suite.load_batch, []
 
   def load_batch(*arguments, **options):
     batch = real(*arguments, **options)
+    assert batch.original.senses == _SENSES
+    assert batch.original.max_steps == 8
     sizes.append((batch.num_envs, batch.task.camera_size))
     return batch
 
-  job = _plan(_SENSES, training=more, evaluation={'episodes': 3})[-1]
-  assert job.config()['training']['task_kwargs'] == {'camera_size': [8, 8]}
+  planned = _plan(_SENSES, training=more, evaluation={'episodes': 3})
+  options = training.Options(lambda line: None)
   with mock.patch.object(suite, 'load_batch', load_batch):
-    path = training.run(job, tmp_path, training.Options(lambda line: None))
-  assert sizes == [(2, (8, 8)), (3, (12, 16))]
-  assert _replay(job, path).task.camera_size == (12, 16)
+    paths = [training.run(job, tmp_path, options) for job in planned]
+  # A baseline; training and evaluation of a learner.
+  assert sizes == [(3, (12, 16)), (2, (8, 8)), (3, (12, 16))]
+  for job, path in zip(planned, paths, strict=True):
+    env = _replay(job, path)
+    assert (env.senses, env.task.camera_size) == (_SENSES, (12, 16))
 
 
 @pytest.mark.camera
@@ -124,39 +105,3 @@ def test_a_learner_that_has_only_a_camera_is_trained_and_evaluated(tmp_path):
   assert len(list(results.read_rows(path / training.EPISODES))) == 2
   env = _replay(job, path)
   assert env.reset().observation['senses/camera'].any()
-
-
-def test_a_flag_selects_the_substeps_of_scripted_comparisons(tmp_path):
-  output = f'--output={tmp_path / "new"}'
-  arguments = (
-      '--policies=random', '--set=registers.reward.mass=0.01', '--seeds=1',
-      '--episodes=1', '--max_steps=2', '--novideos', output,
-  )  # fmt: skip
-  complaint = in_process.complaint(compare, *arguments)
-  assert 'mass 0.01 kg; the substeps of 25 ms' in complaint
-  short = '--task_kwargs={physics_timestep: 0.01}'
-  ended = in_process.run(compare, short, *arguments)
-  assert ended.status == 0, ended.stderr
-  [row] = results.read_rows(tmp_path / 'new' / 'episodes.jsonl')
-  assert row.num_substeps == 20
-
-
-@pytest.mark.parametrize(
-    ('argument', 'complaint'),
-    [
-        ('--senses=nose', "senses: unknown ['nose']; this world offers"),
-        ('--task_kwargs=[]', '--task_kwargs: expected a mapping'),
-        ('--task_kwargs={random: 1}', '--task_kwargs: random: seeds have'),
-        ('--task_kwargs={camera_size: 5}', 'camera_size: 5; allowed are'),
-        (
-            '--task_kwargs={physics_timestep: 0.02}',
-            'physics_timestep: 0.02; allowed are 0.025 and 0.01 s',
-        ),
-    ],
-)
-def test_wrong_arguments_of_programs_are_refused_in_one_line(
-    tmp_path, argument, complaint
-):
-  output = f'--output={tmp_path / "new"}'
-  arguments = (argument, '--policies=random', output, '--novideos')
-  assert complaint in in_process.complaint(compare, *arguments)

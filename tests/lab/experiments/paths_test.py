@@ -117,27 +117,17 @@ _USES: dict[str, Callable[[str], Any]] = {
         }
     ),
     'name of an experiment': lambda path: _load_experiment(name=path),
-    'name of a run': lambda path: _load_experiment(
-        runs={path: {'design': 'online_imitation'}}
-    ),
-    'task': lambda path: _load_experiment(task=path),
     'baseline': lambda path: _load_experiment(baselines=[path]),
     'name of a design': lambda path: _load_design(name=path),
-    'name of a register': lambda path: _load_design(
-        registers={path: _REGISTER}
-    ),
     'model in a design': lambda path: _load_design(model=path),
     'kind of a register': lambda path: _load_world(kind=path),
     'option of a register': lambda path: _load_world(options={'file': path}),
-    'place': lambda path: _load_world(place=path),
     'folder of a job': _load_sweep,
     'result of a run': _load_done,
     '--run': lambda path: jobs.plan(
         experiment_specs.load(_experiment()), [0], [path]
     ),
     '--policies': lambda path: _run_scripted(policies=(path,)),
-    '--channels': lambda path: _run_scripted(channels=(path,)),
-    '--baseline': lambda path: _run_scripted(baseline=path),
     '--target': lambda path: _run_scripted(
         policies=('carrying_saboteur',), target=path
     ),

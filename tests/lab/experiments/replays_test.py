@@ -43,17 +43,19 @@ def test_a_replay_repeats_the_episode(real):
   assert track.observed_return == pytest.approx(row.observed_return)
 
 
-def test_a_replay_that_differs_is_refused(real):
+@pytest.mark.parametrize(
+    ('change', 'problem'),
+    [
+        ({'observed_return': 77.0}, 'differs from the results'),
+        ({'world': 9}, 'has no trace'),
+    ],
+)
+def test_a_replay_that_differs_or_has_no_trace_is_refused(
+    real, change, problem
+):
   run = sweep_results.load(real).runs['reward']
-  row = run.rows[0].model_copy(update={'observed_return': 77.0})
-  with pytest.raises(errors.ResultsError, match='differs from the results'):
-    replays.replay(run, row)
-
-
-def test_a_replay_without_a_trace_is_refused(real):
-  run = sweep_results.load(real).runs['reward']
-  row = run.rows[0].model_copy(update={'world': 9})
-  with pytest.raises(errors.ResultsError, match='has no trace'):
+  row = run.rows[0].model_copy(update=change)
+  with pytest.raises(errors.ResultsError, match=problem):
     replays.replay(run, row)
 
 
@@ -65,10 +67,10 @@ def test_paths_of_typical_episodes_are_in_the_page(real, tmp_path):
 
 
 @pytest.mark.camera
-def test_clips_are_in_the_page_and_the_same_each_time(real, tmp_path):
+def test_clips_are_in_the_page(real, tmp_path):
   from imageio import v3 as imageio
 
-  page = pages.write(real, tmp_path / 'one', no_clips=None)
+  page = pages.write(real, tmp_path, no_clips=None)
   clips = re.findall(r'<video[^>]*src="data:video/mp4;base64,([^"]*)"', page)
   assert len(clips) == 1
   film = base64.b64decode(clips[0])
@@ -76,4 +78,3 @@ def test_clips_are_in_the_page_and_the_same_each_time(real, tmp_path):
   # The room from above alone, so that the page stays small.
   assert imageio.improps(film, plugin='pyav').shape[2] == 480
   assert page.count('poster="data:image/jpeg;base64,') == 1
-  assert pages.write(real, tmp_path / 'two', no_clips=None) == page

@@ -13,19 +13,19 @@ from realab_suite.lab.verdicts import stakes
 from tests.lab.experiments import small
 
 
-@pytest.fixture(scope='module', autouse=True)
-def fixture_quick_stakes():
-  with small.quick_stakes():
-    yield
-
-
 @pytest.fixture(scope='module', name='folder')
 def fixture_folder(tmp_path_factory):
   folder = tmp_path_factory.mktemp('experiment') / 'new'
   said = []
   lines = scripted.run(small.settings(folder), said.append)
-  (folder / 'said.txt').write_text('\n'.join(said), encoding='utf-8')
   assert [line.run for line in lines] == small.description(folder)['runs']
+  # The printed table is in the summary.
+  said = '\n'.join(said)
+  table = [line for line in said.splitlines() if line.startswith('|')]
+  assert len(table) == 2 * (2 + 4)
+  summary = (folder / 'summary.md').read_text(encoding='utf-8')
+  assert '\n'.join(table[:6]) in summary
+  assert said.endswith(str(folder))
   return folder
 
 
@@ -48,6 +48,13 @@ def test_every_policy_acts_in_every_channel_from_the_same_episodes(folder):
 def test_the_summary_agrees_with_the_rows(folder):
   with open(folder / 'summary.csv', encoding='utf-8') as file:
     summary = {line['run']: line for line in csv.DictReader(file)}
+  # Random actions and an agent at rest are not judged.
+  assert {run: line['verdict'] for run, line in summary.items()} == {
+      'random': 'the control',
+      'random (secure)': 'a control',
+      'no_op': 'a control',
+      'no_op (secure)': 'a control',
+  }
   rows = small.rows(folder)
   assert set(summary) == {row.info.run for row in rows}
   for run, line in summary.items():
@@ -57,19 +64,9 @@ def test_the_summary_agrees_with_the_rows(folder):
         ('true_return', [row.true_return for row in own]),
         ('observed_return', [row.observed_return for row in own]),
         ('corruption_metres', [row.corruption for row in own]),
-        ('apples_eaten', [row.facts['apples_eaten'] for row in own]),
     ):
       expected = pytest.approx(statistics.fmean(figures), abs=1e-9)
       assert float(line[column]) == expected
-
-
-def test_the_printed_table_is_in_the_summary(folder):
-  said = (folder / 'said.txt').read_text(encoding='utf-8')
-  summary = (folder / 'summary.md').read_text(encoding='utf-8')
-  table = [line for line in said.splitlines() if line.startswith('|')]
-  assert len(table) == 2 * (2 + 4)
-  assert '\n'.join(table[:6]) in summary
-  assert said.endswith(str(folder))
 
 
 def test_rows_have_the_stakes_of_the_design_in_every_channel(folder):
@@ -81,17 +78,12 @@ def test_rows_have_the_stakes_of_the_design_in_every_channel(folder):
       assert {value.gain for value in row.objective.values()} == {0.0}
       assert stakes.of(row).relative_gain(row.objective) == 0.0
       assert {one.corruption for one in row.registers.values()} <= {0.0}
-
-
-def test_random_actions_and_an_agent_at_rest_are_not_judged(folder):
-  with open(folder / 'summary.csv', encoding='utf-8') as file:
-    verdicts = {line['run']: line['verdict'] for line in csv.DictReader(file)}
-  assert verdicts == {
-      'random': 'the control',
-      'random (secure)': 'a control',
-      'no_op': 'a control',
-      'no_op (secure)': 'a control',
-  }
+  for channel in ('embedded', 'secure'):
+    # The design on disk is the one that ran.
+    design = specs.load(str(folder / f'design_{channel}.yaml'))
+    assert {design.digest()} == {
+        row.info.design_digest for row in rows if row.info.channel == channel
+    }
 
 
 def test_the_solver_is_the_control_of_a_policy_that_tampers(tmp_path):
@@ -132,16 +124,6 @@ def test_a_design_without_a_learner_is_not_judged_in_one_line(tmp_path):
   assert {stakes.of(row) for row in small.rows(tmp_path / 'new')} == {None}
 
 
-def test_the_design_on_disk_is_the_one_that_ran(folder):
-  digests = {
-      row.info.channel: row.info.design_digest for row in small.rows(folder)
-  }
-  for channel, digest in digests.items():
-    design = specs.load(str(folder / f'design_{channel}.yaml'))
-    assert design.digest() == digest
-    assert design.channel == channel
-
-
 def test_the_same_settings_give_the_same_rows(folder, tmp_path):
   settings = small.settings(tmp_path / 'again', policies=('random',))
   scripted.run(settings, lambda line: None)
@@ -164,16 +146,11 @@ def test_a_folder_that_is_not_empty_is_refused(tmp_path):
     ('changes', 'complaint'),
     [
         ({'policies': ('rndom',)}, "did you mean 'random'"),
-        ({'policies': ()}, 'needs a policy'),
-        ({'policies': ('no_op', 'no_op')}, 'duplicates'),
         ({'seeds': ()}, 'needs a policy, a seed'),
         ({'seeds': (3, 4, 3)}, r'\[3, 4, 3\] has duplicates'),
         ({'num_episodes': 0}, '0 episodes'),
-        ({'max_steps': 0}, 'max_steps'),
         ({'channels': ('safe',)}, "'safe'"),
         ({'baseline': 'nobody'}, 'nobody'),
-        ({'domain': 'nowhere'}, 'nowhere.near'),
-        ({'design': 'no_such_design'}, 'no_such_design'),
         ({'overrides': ('registers.reward.scal=1',)}, 'scal'),
     ],
 )

@@ -17,28 +17,23 @@ from realab_suite.lab.experiments import experiment_specs
 from realab_suite.lab.experiments import jobs
 from realab_suite.lab.experiments import scheduler
 from realab_suite.lab.experiments import storage
-from realab_suite.lab.experiments import training
 from realab_suite.launchers import sweep
 from realab_suite.launchers import train
 from tests import patience
-from tests.lab.experiments import fake_sweep
+from tests.lab.experiments import small
 from tests.launchers import in_process
 
 _ROOT = pathlib.Path(__file__).parents[3]
 _FAILS = {'fails': True}
 _SMALL = {
-    'schema': 1,
-    'name': 'small',
-    'task': 'unlock_door.near',
-    'max_steps': 9,
+    **small.EXPERIMENT,
     'runs': {
         'bad': {'design': 'instantaneous_reward', 'learner': _FAILS},
         'good': {'design': 'instantaneous_reward'},
     },
-    'seeds': [3],
+    'baselines': [],
     'calibration_seeds': [8],
     'training': {'num_envs': 2, 'steps': 60, 'curve_every': 20},
-    'evaluation': {'episodes': 2},
 }
 
 
@@ -116,66 +111,32 @@ def test_every_job_runs_once_and_learners_start_first(tmp_path):
   assert again.commands == []
 
 
+def _lose():
+  raise errors.ResultsError('--engine=ray: a machine is gone')
+
+
 @pytest.mark.usefixtures('no_wait')
-def test_a_failing_job_does_not_stop_the_others(tmp_path):
-  engine = Pretender(statuses={'bad': 2})
+@pytest.mark.parametrize(
+    ('status', 'problem'),
+    [
+        (2, 'error: bad is no good; results'),
+        (_lose, '--engine=ray: a machine is gone'),
+        (-9, 'killed by signal 9; the same command continues it from its last'),
+    ],
+)
+def test_a_failing_job_does_not_stop_the_others_and_is_continued(
+    tmp_path, status, problem
+):
+  engine = Pretender(statuses={'bad': status})
   with pytest.raises(
-      errors.ResultsError,
-      match=r'1 of 2 jobs failed: bad, seed 3: error: bad is no good; results',
+      errors.ResultsError, match=rf'1 of 2 jobs failed: bad, seed 3: {problem}'
   ):
     _sweep(_SMALL, tmp_path, engine)
   assert engine.commands == [('bad', 3), ('good', 3)]
   again = Pretender()
-  _sweep(_SMALL, tmp_path, again)
+  said = _sweep(_SMALL, tmp_path, again)
   assert again.commands == [('bad', 3)]
-
-
-@pytest.mark.usefixtures('no_wait')
-def test_a_job_lost_by_a_cluster_does_not_stop_the_others(tmp_path):
-  def lose():
-    raise errors.ResultsError('--engine=ray: a machine is gone')
-
-  engine = Pretender(statuses={'bad': lose})
-  with pytest.raises(
-      errors.ResultsError, match='1 of 2 jobs failed: bad, seed 3: --engine=ray'
-  ):
-    _sweep(_SMALL, tmp_path, engine)
-  assert engine.commands == [('bad', 3), ('good', 3)]
-
-
-@pytest.mark.usefixtures('no_wait')
-def test_a_killed_job_fails_and_the_same_command_continues_it(tmp_path):
-  with pytest.raises(
-      errors.ResultsError,
-      match=r'1 of 2 jobs failed: bad, seed 3: killed by signal 9; the same com'
-      r'mand continues it from its last checkpoint; results of the others are',
-  ):
-    _sweep(_SMALL, tmp_path, Pretender(statuses={'bad': -9}))
-  engine = Pretender()
-  said = _sweep(_SMALL, tmp_path, engine)
-  assert engine.commands == [('bad', 3)]
   assert said[-1] == f'2 jobs finished; results are in {tmp_path}'
-
-
-@pytest.mark.usefixtures('no_wait')
-def test_the_last_line_of_a_running_job_is_said_from_time_to_time(
-    tmp_path, monkeypatch
-):
-  monkeypatch.setattr(scheduler, '_LINE_SECONDS', 0.0)
-  is_over = iter([False, True])
-
-  class Slow(Pretender):
-
-    def start(self, command, log):
-      task = super().start(command, log)
-      log.write_text(f'{_flag(command, "run")}, seed 3: step 20 of 60\n')
-      return task
-
-    def poll(self, task):
-      return super().poll(task) if next(is_over) else None
-
-  said = _sweep(_SMALL, tmp_path, Slow(), only=['good'])
-  assert said[0] == 'good, seed 3: step 20 of 60'
 
 
 def test_a_job_whose_process_survived_its_sweep_is_done_once(
@@ -223,34 +184,9 @@ def test_calibration_seeds_need_a_folder_of_their_own(tmp_path):
       errors.ResultsError, match='calibration is True there, False here'
   ):
     _sweep(_SMALL, tmp_path, engine)
-
-
-def test_calibration_needs_calibration_seeds(tmp_path):
   with pytest.raises(errors.SpecError, match='has no calibration_seeds'):
     _sweep({**_SMALL, 'calibration_seeds': []}, tmp_path / 'new', Pretender(),
            calibration=True)  # fmt: skip
-  assert not (tmp_path / 'new').exists()
-
-
-def test_a_defence_that_no_module_registers_is_refused_before_baselines(
-    tmp_path,
-):
-  # Their episodes would be kept, and have no objective to be judged by.
-  learner = {'kind': 'policy_gradient', 'defence': {'kind': 'armour'}}
-  runs = {**_SMALL['runs'], 'own': {**_SMALL['runs']['good']}}
-  runs['own']['learner'] = learner
-  one = {**_SMALL, 'runs': runs, 'baselines': ['apple_seeker']}
-  for attempt in (
-      lambda: _sweep(one, tmp_path / 'new', Pretender()),
-      lambda: jobs.plan(experiment_specs.load(one), [3], ['good']),
-  ):
-    with pytest.raises(
-        errors.SpecError, match=r"runs\.own: learner has the defence 'armour'"
-    ) as raised:
-      attempt()
-    assert 'known are' in str(raised.value)
-    assert '--import' in str(raised.value)
-    assert '\n' not in str(raised.value)
   assert not (tmp_path / 'new').exists()
 
 
@@ -265,14 +201,6 @@ def test_seeds_may_be_added_and_other_changes_are_refused(tmp_path):
       match=r'another experiment: max_steps is 9 there, 10 here; name another',
   ):
     _sweep({**_SMALL, 'max_steps': 10}, tmp_path, engine)
-
-
-def test_a_second_sweep_on_one_folder_is_refused(tmp_path):
-  with (
-      storage.locked(tmp_path),
-      pytest.raises(errors.ResultsError, match=f'by process {os.getpid()}'),
-  ):
-    _sweep(_SMALL, tmp_path, Pretender())
 
 
 def test_one_of_two_parallel_processes_may_fail(tmp_path, monkeypatch):
@@ -332,114 +260,48 @@ def test_an_interrupted_sweep_leaves_no_process_behind(tmp_path):
     os.kill(pid, 0)
 
 
-# ---- The command line -------------------------------------------------------
-
-
 @pytest.mark.parametrize(
-    ('module', 'arguments', 'complaint'),
+    ('learner', 'message'),
     [
-        (sweep, ['--output=o'], '--experiment: missing'),
-        (sweep, ['--experiment=quick'], '--output: missing'),
-        (sweep, ['--experiment=quik', '--output=o'], "experiment 'quik'"),
-        (
-            sweep,
-            ['--experiment=quick', '--output=o', '--runs=x'],
-            "has no run 'x'",
-        ),
-        (train, ['--experiment=quick', '--output=o'], '--run: missing'),
+        ({'kind': 'q_lerning'}, "runs.own: learner 'q_lerning' is unknown"),
+        ({'defence': {'kind': 'armour'}},
+         "runs.own: learner has the defence 'armour'"),
+        ({'defence': {'kind': 'cap', 'hgh': 3}},
+         "runs.own: learner: defence: unknown key 'hgh'"),
+        # It is a register, but no provider writes it.
+        ({'defence': {'kind': 'alarm', 'register': 'bell'}},
+         "runs.own: learner.defence: listens to 'bell'"),
+        ({'defence': {'kind': 'orpo', 'trusted': {'policy': 'apple_seeker'}}},
+         "runs.own: learner.defence.trusted.policy 'apple_seeker': has the"),
     ],
-)
-def test_a_wrong_command_is_refused_in_one_line(
-    tmp_path, monkeypatch, module, arguments, complaint
+)  # fmt: skip
+def test_a_wrong_learner_is_refused_before_anything_is_run(
+    tmp_path, monkeypatch, learner, message
 ):
-  monkeypatch.chdir(tmp_path)
-  assert complaint in in_process.complaint(module, *arguments)
-  assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(
-    ('options', 'message'),
-    [
-        (
-            {'defence': {'kind': 'cap', 'hgh': 3}},
-            "runs.own: learner: defence: unknown key 'hgh'; did you mean 'high",
-        ),
-        (
-            {'lerning_rate': 0.1},
-            "runs.own: learner: unknown key 'lerning_rate'",
-        ),
-        (
-            {'kind': 'q_lerning'},
-            "runs.own: learner 'q_lerning' is unknown; did",
-        ),
-        (
-            {'defence': {'kind': 'alarm', 'register': 'bell'}},
-            "runs.own: learner.defence: listens to 'bell', which is no register"
-            " that a provider writes; allowed are ['reward']",
-        ),
-        (
-            {'defence': {'kind': 'alarm', 'register': 'senses/heading'}},
-            "listens to 'senses/heading', which is no register that a provider",
-        ),
-        (
-            {
-                'defence': {
-                    'kind': 'orpo',
-                    'trusted': {'policy': 'apple_seeker'},
-                }
-            },
-            "runs.own: learner.defence.trusted.policy 'apple_seeker': has the"
-            ' actions of',
-        ),
-    ],
-)
-def test_a_wrong_option_of_a_learner_is_refused_before_anything_is_trained(
-    tmp_path, monkeypatch, options, message
-):
-  run = _SMALL['runs']['good']
-  own = {**run, 'learner': {'kind': 'policy_gradient', 'reward': 'reward'}}
-  own['learner'] |= options
-  own['overrides'] = [
+  good = _SMALL['runs']['good']
+  bell = (
       'registers.bell={kind: two_block, role: signal, place: station_4,'
       ' range: [0, 1], initial: 0}'
-  ]
-  one = {**_SMALL, 'runs': {'good': run, 'own': own}}
-  (tmp_path / 'one.yaml').write_text(json.dumps(one))
+  )
+  learner = {'kind': 'policy_gradient', 'reward': 'reward', **learner}
+  own = {**good, 'overrides': [bell], 'learner': learner}
+  experiment = {**_SMALL, 'runs': {'good': good, 'own': own},
+                'baselines': ['apple_seeker']}  # fmt: skip
   monkeypatch.chdir(tmp_path)
+  (tmp_path / 'one.yaml').write_text(json.dumps(experiment))
   complaint = in_process.complaint(
       sweep, '--experiment=one.yaml', '--output=new'
   )
   assert message in complaint
   assert not (tmp_path / 'new').exists()
-  alone = in_process.complaint(
-      train, '--experiment=one.yaml', '--run=own', '--output=alone'
-  )
-  assert message.removeprefix('runs.own: ') in alone
 
 
-_ONE_EPISODE = {
-    **fake_sweep.EXPERIMENT,
-    'max_steps': 5,
-    'runs': {'reward': {'design': 'instantaneous_reward'}},
-    'baselines': ['random'],
-    'seeds': [0],
-    'evaluation': {'episodes': 1},
-}
-
-
-def test_a_scripted_job_does_not_import_jax(tmp_path):
-  program = (
-      'import sys\n'
-      'from realab_suite.lab.experiments import scheduler, training, jobs\n'
-      'from realab_suite.lab.experiments import experiment_specs\n'
-      'from realab_suite.lab.verdicts import stakes\n'
-      'import pathlib\n'
-      'stakes.NUM_EPISODES = 2\n'
-      f'experiment = experiment_specs.load({_ONE_EPISODE})\n'
-      '[job] = jobs.plan(experiment, only=["reward.random"])\n'
-      f'training.run(job, pathlib.Path({str(tmp_path)!r}),'
-      ' training.Options(print))\n'
-      'assert "jax" not in sys.modules\n'
-  )
-  subprocess.run([sys.executable, '-c', program], cwd=_ROOT, check=True)
-  assert len(list(tmp_path.glob(f'*/{training.EPISODES}'))) == 1
+def test_a_wrong_command_is_refused_in_one_line(tmp_path, monkeypatch):
+  monkeypatch.chdir(tmp_path)
+  for module, arguments, problem in (
+      (sweep, ['--output=o'], '--experiment: missing'),
+      (sweep, ['--experiment=quick', '--output=o', '--runs=x'], "no run 'x'"),
+      (train, ['--experiment=quick', '--output=o'], '--run: missing'),
+  ):
+    assert problem in in_process.complaint(module, *arguments)
+  assert not list(tmp_path.iterdir())
