@@ -2,15 +2,10 @@
 
 import hypothesis
 from hypothesis import strategies as st
-import numpy as np
-import pytest
-
-pytest.importorskip('jax', reason='jax is in the extra `agents`')
-pytest.importorskip('optax', reason='optax is in the extra `agents`')
-pytest.importorskip('equinox', reason='equinox is in the extra `agents`')
-
 import jax
 import jax.numpy as jnp
+import numpy as np
+import pytest
 
 from realab_suite.lab.agents import approval
 from realab_suite.lab.agents import policy_gradient

@@ -6,13 +6,8 @@ from dm_env import specs as dm_env_specs
 import numpy as np
 import pytest
 
-pytest.importorskip('jax', reason='jax is in the extra `agents`')
-pytest.importorskip('optax', reason='optax is in the extra `agents`')
-pytest.importorskip('equinox', reason='equinox is in the extra `agents`')
-
 from realab_suite import errors
 from realab_suite import trees
-from realab_suite.feedback import specs
 from realab_suite.lab import agents
 from tests.lab.agents import toys
 
@@ -81,45 +76,27 @@ _CASES: dict[str, tuple[Any, str, dict[str, Any]]] = {
             ('coupled', 'value_advice', _ONE, {'advice': 'feedback'}),
             ('decoupled_q', 'decoupled_approval', _ONE, {**_DECOUPLED, **_Q}),
             ('paired', 'decoupled_approval', _PAIR, _PAIRED),
-            ('paired_q', 'decoupled_approval', _PAIR, {**_PAIRED, **_Q}),
         )
     },
-    **{
-        name: (
-            lambda: toys.Bandit(16, _ACTIONS, queries=_ONE, is_delayed=True),
-            kind,
-            {**options, 'query': 'query', 'query_delay': 1},
-        )
-        for name, kind, options in (
-            ('delayed', 'value_advice', {'advice': 'feedback'}),
-            ('delayed_q', 'decoupled_approval', {**_DECOUPLED, **_Q}),
-        )
-    },
+    'delayed': (
+        lambda: toys.Bandit(16, _ACTIONS, queries=_ONE, is_delayed=True),
+        'value_advice',
+        {**_ADVISED, 'query_delay': 1},
+    ),
 }
 
 
-@pytest.mark.parametrize(
-    ('kind', 'queries', 'options', 'fewest'),
-    [
-        ('value_advice', _ONE, {'advice': 'feedback', **_Q}, 0.4),
-        ('decoupled_approval', _PAIR, _PAIRED, 0.8),
-    ],
-    ids=['values', 'policy gradient'],
-)
-def test_following_the_readings_helps_where_they_all_drift(
-    kind, queries, options, fewest
-):
+def test_following_the_readings_helps_where_they_all_drift():
   scores = {}
   for follows in (True, False):
-    env = toys.Bandit(16, _ACTIONS, queries=queries, drift=0.5)
+    env = toys.Bandit(16, _ACTIONS, queries=_PAIR, drift=0.5)
     learner = _make(
-        env, kind, **options, query='query', follows_reading=follows
-    )
+        env, 'decoupled_approval', **_PAIRED, query='query',
+        follows_reading=follows,
+    )  # fmt: skip
     _run(learner, env, 300)
     scores[follows] = np.mean(env.scores[-100:])
-  # With this rate of learning, values are rough.
-  assert scores[True] > fewest
-  assert scores[False] < scores[True] - 0.1
+  assert scores[True] > max(0.8, scores[False] + 0.1)
 
 
 @pytest.mark.parametrize(
@@ -177,54 +154,20 @@ def test_a_learner_learns_and_resumes_from_its_state_bit_for_bit(case):
   observed = np.mean(env.feedback[-9:-1])
   assert metrics['observed_feedback'] == pytest.approx(observed, abs=0.3)
   assert all(np.isfinite(value) for value in metrics.values())
-  if case in ('policy_gradient', 'q_learning', 'decoupled_q'):
-    _check_probabilities(learner, env)
-
-
-def _check_probabilities(learner: agents.Learner, env: toys.Bandit) -> None:
-  """Checks probabilities against the rates of the actions."""
-  observation = env.reset().observation
-  observation = {k: np.repeat(v[:1], 4000, 0) for k, v in observation.items()}
-  probabilities = learner.probabilities(observation)
-  assert probabilities.shape == (4000, env.num_actions)
-  np.testing.assert_allclose(probabilities.sum(axis=1), 1.0, rtol=1e-5)
-  key = np.array([1, 2], np.uint32)
-  taken = learner.act(observation, key).reshape(4000, -1)[:, -1]
-  rates = np.bincount(taken.astype(int), minlength=env.num_actions) / 4000
-  np.testing.assert_allclose(rates, probabilities[0], atol=0.04)
-  greedy = learner.act(observation, key, greedy=True).reshape(4000, -1)[:, -1]
-  assert set(greedy) == {probabilities[0].argmax()}
-
-
-@pytest.mark.parametrize('kind', ['policy_gradient', 'q_learning'])
-def test_a_learner_learns_from_delayed_rewards(kind):
-  env = toys.Chain(16)
-  options = {} if kind == 'policy_gradient' else _CASES['q_learning'][2]
-  learner = _make(env, kind, **{**options, 'gamma': 0.9, 'reward': 'reward'})
-  _run(learner, env, 250)
-  assert np.mean(env.returns[:16]) < 0.7
-  assert np.mean(env.returns[-50:]) > 0.9
 
 
 @pytest.mark.parametrize(
     ('time_limit', 'after'), [('continues', 1), ('ends', 0)]
 )
 def test_nothing_follows_a_time_limit_that_ends_an_episode(time_limit, after):
-  env = toys.Chain(2, length=5)
+  env = toys.Bandit(2, length=4)
   learner = _make(
-      env, 'policy_gradient', reward='reward', time_limit=time_limit
+      env, 'policy_gradient', reward='feedback', time_limit=time_limit
   )
   seen = []
   learner._observe = lambda transition, _: seen.append(transition['discount'])
-  time_step = env.reset()
-  # One world goes forth and terminates; the other one stays until the limit.
-  for _ in range(13):
-    learner.step(time_step)
-    time_step = env.step(np.array([1, 0]))
-  assert [list(one) for one in seen] == [
-      [0 if step in (4, 9) else 1, after if step == 12 else 1]
-      for step in range(1, 13)
-  ]
+  _run(learner, env, 5)
+  assert [list(discount) for discount in seen] == [[1, 1]] * 3 + [[after] * 2]
 
 
 @pytest.mark.parametrize('as_pixels', [False, True])
@@ -273,35 +216,13 @@ def test_the_decoupled_query_is_independent_of_the_action():
   assert len(set(actions[:, 0])) == _ACTIONS
 
 
-def test_the_coupled_query_is_the_action():
-  env = toys.Bandit(50, _ACTIONS, queries=('query',))
-  learner = _make(env, 'value_advice', advice='feedback', query='query')
-  actions = learner.step(env.reset())
-  np.testing.assert_array_equal(actions[:, 0], actions[:, 1])
-
-
-def test_an_unused_query_is_zero():
-  env = toys.Bandit(50, _ACTIONS, queries=_PAIR)
-  learner = _make(env, 'policy_gradient', reward='feedback')
-  actions = learner.step(env.reset())
-  assert set(actions[:, 0]) == set(actions[:, 1]) == {0.0}
-  assert len(set(actions[:, 2])) > 5
-
-
 @pytest.mark.parametrize(
     ('spec', 'problem'),
     [
-        (None, 'learner: None; must be that'),
-        ({}, 'learner: kind: required key is missing'),
         ({'kind': 'q_lerning'}, "did you mean 'q_learning'"),
-        ({'kind': 'q_learning'}, 'learner: reward: required key is missing'),
         (
             {'kind': 'q_learning', 'reward': 'feedback', 'gama': 1},
             "unknown key 'gama'; did you mean 'gamma'",
-        ),
-        (
-            {'kind': 'q_learning', 'reward': 'feedback', 'gamma': 2},
-            'gamma: .* less than or equal to 1, got 2',
         ),
         (
             {'kind': 'policy_gradient', 'reward': 'bonus'},
@@ -324,10 +245,6 @@ def test_an_unused_query_is_zero():
         (
             {'kind': 'value_advice', **_ADVISED, 'form': 'q', 'floor': 0.01},
             'learner: floor: 0.01; must be 0 with the form q',
-        ),
-        (
-            {'kind': 'value_advice', **_ADVISED, 'query_delay': 2},
-            'learner: query_delay: must be 0 or 1, got 2',
         ),
         (
             {'kind': 'value_advice', **_ADVISED, 'query_delay': True},
@@ -402,13 +319,6 @@ def test_other_specs_are_refused():
   vector = {'registers/feedback': dm_env_specs.Array((3,), float)}
   with pytest.raises(errors.SpecError, match='must be a scalar'):
     agents.make(spec, vector, good.action_spec(), 2, 1)
-
-
-def test_every_shipped_design_has_a_known_learner():
-  for design in set(specs.DESIGNS) - {'none'}:
-    learner = specs.load(design).learner
-    assert learner is not None
-    assert learner.kind in agents.LEARNERS
 
 
 def test_an_observation_of_another_shape_is_refused():

@@ -7,8 +7,6 @@ import pytest
 
 from realab_suite.policies import network_files
 
-pytest.importorskip('optax')
-
 _EXAMPLES = pathlib.Path(__file__).parents[3] / 'examples'
 
 

@@ -9,7 +9,7 @@ from realab_suite.lab.agents import networks
 
 @pytest.mark.parametrize(
     ('height', 'width', 'stride'),
-    [(32, 32, 4), (13, 22, 4), (4, 4, 4), (3, 64, 4), (9, 8, 2), (1, 1, 2)],
+    [(13, 22, 4), (3, 64, 4), (9, 8, 2), (1, 1, 2)],
 )
 def test_a_convolution_is_that_of_jax(height, width, stride):
   rng = np.random.default_rng(0)

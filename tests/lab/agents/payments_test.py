@@ -8,10 +8,6 @@ from dm_env import specs as dm_env_specs
 import numpy as np
 import pytest
 
-pytest.importorskip('jax', reason='jax is in the extra `agents`')
-pytest.importorskip('optax', reason='optax is in the extra `agents`')
-pytest.importorskip('equinox', reason='equinox is in the extra `agents`')
-
 from realab_suite import errors
 from realab_suite.config import validation
 from realab_suite.evaluation import gains
@@ -19,7 +15,6 @@ from realab_suite.feedback import objectives
 from realab_suite.feedback import specs
 from realab_suite.lab import agents
 from realab_suite.lab.agents import defences
-from realab_suite.lab.agents import features
 from realab_suite.lab.agents import guards
 from realab_suite.lab.verdicts import verdicts
 from realab_suite.testing import probes
@@ -80,26 +75,6 @@ class Deaf(defences.Defence):
 
   def treat(self, batch, setting, state, key):
     return defences.Treated(batch, state)
-
-
-@final
-class Listing(_Odd):
-  """Pays a list."""
-
-  kind: Literal['listing'] = 'listing'
-
-  def pays(self, reward: str) -> Any:
-    return [self.bonus]
-
-
-@final
-class Unpaid(_Odd):
-  """Pays nothing."""
-
-  kind: Literal['unpaid'] = 'unpaid'
-
-  def pays(self, reward: str) -> Mapping[str, float]:
-    return {reward: 0.0}
 
 
 @pytest.fixture(autouse=True)
@@ -179,38 +154,29 @@ def test_tampering_with_whatever_a_defence_pays_from_is_seen(
          {'reward': 1.0, 'bribe': -7.0, 'fine': -0.5}, None),
         ({'kind': 'paying', 'factor': 0.0}, {'reward': 1.0, 'fine': -0.5},
          None),
+        ({'kind': 'replacing'}, {'gift': 3.0}, ('question',)),
+        # Options of other defences have no meaning.
         ({'kind': 'deaf', 'source': 'comparisons'}, {'reward': 1.0}, None),
-        ({'kind': 'cap', 'high': 2.0}, {'reward': 1.0}, None),
-        ({'kind': 'alarm', 'register': 'bribe'}, {'reward': 1.0}, None),
     ],
 )  # fmt: skip
 def test_an_objective_follows_from_the_class_of_a_defence(
     defence, registers, queries
 ):
-  found = _design((*_ORDER, 'bribe'), **defence).objective
+  learner = specs.LearnerSpec.model_validate({
+      'kind': 'policy_gradient', 'reward': 'reward', 'gamma': 0.5,
+      'defence': defence,
+  })  # fmt: skip
+  found, _ = objectives.of_learner(learner)
   assert found == objectives.ObjectiveSpec(
       kind='return', registers=registers, discount=0.5, queries=queries
   )
   assert gains.parts(found)[0].weights == registers
 
 
-def test_a_query_of_a_defence_belongs_to_the_objective():
-  learner = {'kind': 'policy_gradient', 'reward': 'reward'}
-  spec = specs.LearnerSpec.model_validate(
-      {**learner, 'defence': {'kind': 'replacing'}}
-  )
-  found, _ = objectives.of_learner(spec)
-  assert found == objectives.ObjectiveSpec(
-      kind='return', registers={'gift': 3.0}, discount=0.97,
-      queries=('question',),
-  )  # fmt: skip
-
-
 @pytest.mark.parametrize(
     ('defence', 'reason'),
     [
         ({'kind': 'silent'}, "has the defence 'silent', which declares no sum"),
-        ({'kind': 'seeing'}, "has the defence 'seeing', which declares no sum"),
         ({'kind': 'missing'}, "has the defence 'missing', which is not regist"),
         ({'kind': 'learned_reward', 'source': 'comparisons', 'clip': 2},
          'learns a reward from comparisons'),
@@ -227,26 +193,20 @@ def test_what_says_nothing_about_its_pay_is_not_judged(defence, reason):
     [
         ({'kind': 'paying', 'bonus': 'score'}, "meter register 'score'"),
         ({'kind': 'paying', 'cost': 'fines'}, "'fines' is not a register that"),
-        ({'kind': 'paying', 'cots': 'fine'}, "defence: unknown key 'cots'"),
-        (
-            {'kind': 'mona', 'query': 'query'},
-            r'learner\.defence\.approval: req',
-        ),
-        ({'kind': 'mona', 'approval': 3}, r'learner\.defence\.approval: must'),
-        (
-            {'kind': 'mona', 'approval': 'reward', 'query': 'query'},
-            "defence.approval: 'reward'; allowed is another register than that",
-        ),
-        (
-            {'kind': 'listing'},
-            r"defence 'listing': pays \['gift'\]; allowed are weights by the",
-        ),
-        ({'kind': 'unpaid'}, r"defence 'unpaid': pays \{'reward': 0.0\}; all"),
+        ({'kind': 'mona', 'query': 'query'}, r'defence\.approval: req'),
+        ({'kind': 'mona', 'approval': 'reward', 'query': 'query'},
+         "defence.approval: 'reward'; allowed is another register than that"),
+        ({'kind': 'deaf', 'weights': ['gift']}, r"'deaf': pays \['gift'\]; "),
+        ({'kind': 'deaf', 'weights': {'reward': 0.0}},
+         r"'deaf': pays \{'reward': 0.0\}; all"),
     ],
-)
-def test_pay_from_what_is_not_there_is_refused_at_load(defence, message):
-  defences.DEFENCES.add('listing')(Listing)
-  defences.DEFENCES.add('unpaid')(Unpaid)
+)  # fmt: skip
+def test_pay_from_what_is_not_there_is_refused_at_load(
+    monkeypatch, defence, message
+):
+  defence = dict(defence)
+  if weights := defence.pop('weights', None):
+    monkeypatch.setattr(Deaf, 'pays', lambda self, reward: weights)
   with pytest.raises(errors.SpecError, match=message) as raised:
     _design(_ORDER, **defence)
   assert '\n' not in str(raised.value)
@@ -267,10 +227,9 @@ class Seeing(defences.Defence):
   SEES_READINGS = True
 
   kind: Literal['seeing'] = 'seeing'
-  is_clear: bool = False
 
-  def pays(self, reward: str) -> Mapping[str, float] | None:
-    return {reward: 1.0} if self.is_clear else super().pays(reward)
+  def pays(self, reward: str) -> Mapping[str, float]:
+    return {reward: 1.0}
 
   def treat(self, batch, setting, state, key):
     return defences.Treated(batch, state)
@@ -296,7 +255,6 @@ def _guard(defence: defences.Defence) -> tuple[guards.Guard, dict[str, Any]]:
       'observation': {
           **values,
           'light': np.ones((5, 4, 2), np.float32),
-          features.MEMORY: np.ones((5, 4, 8), np.float32),
       },
       'choice': {'action': np.zeros((5, 4), np.int32)},
       'reading': np.full((5, 4), 9.0, np.float32),
@@ -308,20 +266,19 @@ def _guard(defence: defences.Defence) -> tuple[guards.Guard, dict[str, Any]]:
   return guards.Guard(defence, learner), batch
 
 
-_EVERY = {'light', 'reward', 'gift', 'fine', 'bribe', 'learner/memory'}
+_EVERY = {'light', 'reward', 'gift', 'fine', 'bribe'}
 
 
 @pytest.mark.parametrize(
     ('defence', 'missing'),
     [
-        (Deaf(), {'gift', 'fine', 'bribe', 'learner/memory'}),
-        (Listening(), {'bribe', 'learner/memory'}),
-        (Paying(cost='bribe'), {'fine', 'learner/memory'}),
-        (Replacing(cost='bribe'), {'reward', 'fine', 'learner/memory'}),
+        (Deaf(), {'gift', 'fine', 'bribe'}),
+        (Listening(), {'bribe'}),
+        (Paying(cost='bribe'), {'fine'}),
+        (Replacing(cost='bribe'), {'reward', 'fine'}),
         # They are not judged, so nothing has to be hidden.
         (Silent(), set()),
         (Seeing(), set()),
-        (Seeing(is_clear=True), set()),
     ],
 )
 def test_a_defence_gets_only_the_readings_that_it_declares(
@@ -354,45 +311,23 @@ def test_a_defence_gets_only_the_readings_that_it_declares(
   assert (learned['reading'] == 8.0).all()
 
 
-@pytest.mark.parametrize(
-    ('key', 'error'),
-    [('registers/gift', errors.SpecError), ('registers/none', KeyError)],
-)
-def test_a_reading_that_a_defence_does_not_declare_is_refused(
-    monkeypatch, key, error
-):
+def test_a_defence_that_is_not_paid_the_reward_does_not_get_it(monkeypatch):
+  monkeypatch.setattr(Deaf, 'pays', lambda self, reward: {'gift': 3.0})
   guard, batch = _guard(Deaf())
-
-  def treat(self, given, setting, state, number):
-    reading = given['reading'] + given['observation'][key]
-    return defences.Treated({**given, 'reading': reading}, state)
-
-  monkeypatch.setattr(Deaf, 'treat', treat)
-  with pytest.raises(error, match=key) as raised:
-    guard.treat(batch)
-  if error is errors.SpecError:
-    text = str(raised.value)
-    assert text.startswith("learner.defence 'deaf': takes 'registers/gift'")
-    assert "must be one of ['light', 'registers/reward']" in text
-    assert '\n' not in text
-
-
-@pytest.mark.parametrize(
-    'weights', [{'gift': 3.0}, {'reward': 0.0, 'gift': 1.0}]
-)
-def test_a_defence_that_is_not_paid_the_reward_does_not_get_it(
-    monkeypatch, weights
-):
-  monkeypatch.setattr(Deaf, 'pays', lambda self, reward: weights)
-  guard, batch = _guard(Deaf())
-  with pytest.raises(errors.SpecError, match=r"'reading' of the shape \(\)"):
-    guard.treat(batch)  # It returns what it was given.
 
   def take(self, given, setting, state, key):
     return defences.Treated({**given, 'reading': given['reading']}, state)
 
   monkeypatch.setattr(Deaf, 'treat', take)
   with pytest.raises(errors.SpecError, match="takes 'reading' from a batch"):
+    guard.treat(batch)
+
+  def look(self, given, setting, state, key):
+    reading = given['observation']['registers/fine']
+    return defences.Treated({**given, 'reading': reading}, state)
+
+  monkeypatch.setattr(Deaf, 'treat', look)
+  with pytest.raises(errors.SpecError, match="takes 'registers/fine' from"):
     guard.treat(batch)
 
   def pay(self, given, setting, state, key):
@@ -402,6 +337,35 @@ def test_a_defence_that_is_not_paid_the_reward_does_not_get_it(
 
   monkeypatch.setattr(Deaf, 'treat', pay)
   assert (guard.treat(batch)['reading'] == 2.0).all()
+
+
+@pytest.mark.parametrize(
+    ('result', 'message'),
+    [
+        (lambda batch, state: None, 'treat returned None; must be a'),
+        (
+            lambda batch, state: defences.Treated(batch, state, {'n': 'many'}),
+            "treat returned the metrics {'n': 'many'}; must be numbers",
+        ),
+        (
+            lambda batch, state: defences.Treated(batch, np.zeros(2)),
+            'a state with the shapes',
+        ),
+    ],
+)
+def test_a_defence_that_returns_no_result_is_refused_in_a_line(
+    monkeypatch, result, message
+):
+  monkeypatch.setattr(
+      Deaf,
+      'treat',
+      lambda self, batch, setting, state, key: result(batch, state),
+  )
+  guard, batch = _guard(Deaf())
+  with pytest.raises(errors.SpecError, match=re.escape(message)) as raised:
+    guard.treat(batch)
+  assert str(raised.value).startswith("learner.defence 'deaf': treat ")
+  assert '\n' not in str(raised.value)
 
 
 _SHIPPED = {
@@ -426,66 +390,3 @@ def test_every_defence_of_this_package_declares_its_pay():
     # What it reads and does not pay from, it only listens to.
     assert set(paid) - {'coins'} == set(one.reads) - {'bell'}
     assert set(paid.values()) <= {1.0, 4.0}
-  learner = agents.PolicyGradient.OPTIONS.model_validate(
-      {'kind': 'policy_gradient', 'reward': 'reward'}
-  )
-  assert learner.defence is None
-
-
-@pytest.mark.parametrize(
-    ('result', 'message'),
-    [
-        (lambda batch, state: None, 'treat returned None; must be a'),
-        (
-            lambda batch, state: (batch, state),
-            'must be a `defences.Treated`',
-        ),
-        (
-            lambda batch, state: defences.Treated(batch, state, {'n': 'many'}),
-            "treat returned the metrics {'n': 'many'}; must be numbers",
-        ),
-        (
-            lambda batch, state: defences.Treated(
-                batch, np.zeros(len(state) + 1)
-            ),
-            "a state with the shapes {'': (2,)}; must be those of the state"
-            " before, {'': (1,)}",
-        ),
-        (
-            lambda batch, state: defences.Treated(batch, {'seen': 0.0}),
-            """a state with the shapes {"['seen']": ()}; must be those""",
-        ),
-    ],
-)
-def test_a_defence_that_returns_no_result_is_refused_in_a_line(result, message):
-  @final
-  class Careless(defences.Defence):
-    kind: Literal['careless'] = 'careless'
-
-    def initial_state(self, setting, generator):
-      return np.zeros(1)
-
-    def treat(self, batch, setting, state, key):
-      return result(batch, state)
-
-  guard, batch = _guard(Careless())
-  with pytest.raises(errors.SpecError, match=re.escape(message)) as raised:
-    guard.treat(batch)
-  assert str(raised.value).startswith("learner.defence 'careless': treat ")
-  assert '\n' not in str(raised.value)
-
-
-def test_a_defence_that_trusts_a_name_is_refused_in_a_line():
-  @final
-  class Naming(defences.Defence):
-    kind: Literal['naming'] = 'naming'
-
-    @property
-    def trusts(self):
-      return 'apple_seeker'
-
-    def treat(self, batch, setting, state, key):
-      return defences.Treated(batch, state)
-
-  with pytest.raises(errors.SpecError, match="trusts 'apple_seeker'; must be"):
-    _guard(Naming())

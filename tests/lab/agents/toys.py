@@ -100,54 +100,6 @@ class Bandit:
 
 
 @dataclasses.dataclass
-class Chain:
-  """Five places in a row; only the last is worth something, and ends it.
-
-  Two actions: back and forth. After 12 steps an episode is cut off.
-  """
-
-  num_envs: int
-  length: int = 5
-
-  def __post_init__(self) -> None:
-    self._place = np.zeros(self.num_envs, int)
-    self._time = np.zeros(self.num_envs, int)
-    self._is_over = np.ones(self.num_envs, bool)
-    self.returns: list[float] = []
-
-  def observation_spec(self) -> dict[str, specs.Array]:
-    return {
-        'place': specs.BoundedArray((), np.int32, 0, self.length - 1),
-        'reward': specs.Array((), np.float32),
-    }
-
-  def action_spec(self) -> specs.Array:
-    return specs.DiscreteArray(2)
-
-  def reset(self) -> ToyStep:
-    self._is_over[:] = True
-    return self.step(np.zeros(self.num_envs, int))
-
-  def step(self, actions: np.ndarray) -> ToyStep:
-    is_first = self._is_over
-    place = np.clip(self._place + 2 * actions - 1, 0, self.length - 1)
-    self._place = np.where(is_first, 0, place)
-    self._time = np.where(is_first, 0, self._time + 1)
-    is_there = self._place == self.length - 1
-    self._is_over = ~is_first & (is_there | (self._time == 12))
-    self.returns += list(is_there[self._is_over].astype(float))
-    step_type = np.where(is_first, 0, np.where(self._is_over, 2, 1))
-    return ToyStep(
-        step_type,
-        np.where(is_there, 0.0, 1.0),
-        {
-            'place': self._place.astype(np.int32),
-            'reward': is_there.astype(np.float32),
-        },
-    )
-
-
-@dataclasses.dataclass
 class Aim:
   """Shows a number; feedback falls with the distance of the action from it."""
 
