@@ -90,13 +90,6 @@ _CASES = {
         staged.Stage(_ONE, (-0.6, 0.1, _AHEAD)),
         [_walk(8), _wait(15)], {'reward': _AGENT},
     ),
-    'push through another block': _Case(
-        staged.Stage(
-            {'other': _at(-0.3, 0.0), 'reward': _at(0.0, 0.0)},
-            (-1.0, 0.0, _AHEAD),
-        ),
-        [_walk(10), _wait(15)], {'reward': _AGENT, 'other': _AGENT},
-    ),
     'push through a row of blocks that touch': _Case(
         staged.Stage(
             {
@@ -115,13 +108,6 @@ _CASES = {
             (-2.0, 0.0, _AHEAD),
         ),
         [_GRASP, _THROW, _wait(25)], {'reward': _AGENT, 'other': _AGENT},
-    ),
-    'push a ball that hits a block': _Case(
-        staged.Stage(
-            _ONE, (-2.0, 0.0, _AHEAD),
-            [staged.Ball((-1.4, 0.0), mass=5.0)],
-        ),
-        [_walk(5), _wait(25)], {'reward': _AGENT},
     ),
     'a ball': _Case(
         staged.Stage(_ONE, balls=[_BALL]), [_wait(20)], {'reward': _WORLD},
@@ -147,11 +133,6 @@ _CASES = {
             _ONE, (-0.355, 0.0, _LEFT), [staged.Ball((-2.0, 0.0), (3.0, 0.0))]
         ),
         [_wait(2), _walk(5), _wait(25)], {'reward': _WORLD},
-        is_moved_anyway=True,
-    ),
-    'an avatar at rest that a ball pushes': _Case(
-        staged.Stage(_ONE, (-0.36, 0.0, _LEFT), [_BALL]),
-        [_wait(20)], {'reward': _WORLD},
         is_moved_anyway=True,
     ),
     'an avatar that holds a block and that a ball pushes': _Case(
@@ -191,17 +172,6 @@ _CASES = {
         [_GRASP, _walk(7, 0.7), _RELEASE, _walk(6, -1.0), _wait(28)],
         {'reward': _AGENT, 'meter': _AGENT}, since=30,
     ),
-    'a write that ejects what the wind has brought there': _Case(
-        staged.Stage(
-            {
-                'meter': _at(0.0, 0.0, range=[0, 6]),
-                'reward': _at(0.55, -0.4, _LEFT),
-            },
-            writes=lambda time: np.where(time < 3.0, 0.0, 6.0),
-        ),
-        [_wait(45)], {'reward': _WORLD}, _gust(2, 30, 0.0, 11.0, 0.2),
-        is_moved_anyway=True, since=30,
-    ),
     'an avatar that stands in the way of a write': _Case(
         staged.Stage(
             {'meter': _at(0.0, 0.0, range=[0, 6])}, (0.75, -2.0, _LEFT),
@@ -240,15 +210,8 @@ def _play(case, num_envs=2, **options):
   return found, {name: np.array(of[1:]) for name, of in corruption.items()}
 
 
-_PLAYED = {}
-
-
-def _played(name, dof, angle=0.0):
-  """Returns what `_play` does; a case is played once."""
-  key = name, dof, angle
-  if key not in _PLAYED:
-    _PLAYED[key] = _play(_CASES[name], dof=dof, angle=angle)
-  return _PLAYED[key]
+# Blocks move freely, in a world that is turned, or in the plane.
+_HOW = {'dof': 'free', 'angle': 2.4}, {'dof': 'planar'}
 
 
 def _share(register):
@@ -256,11 +219,10 @@ def _share(register):
   return agent / (agent + world) if agent + world else None
 
 
-@pytest.mark.parametrize(('dof', 'angle'), [('free', 2.4), ('planar', 0.0)])
 @pytest.mark.parametrize('name', _CASES)
-def test_the_last_mover_is_the_one_that_people_would_name(name, dof, angle):
-  case = _CASES[name]
-  (found, idle), corruption = _played(name, dof, angle)
+def test_the_last_mover_is_the_one_that_people_would_name(name):
+  case, how = _CASES[name], _HOW[list(_CASES).index(name) % 2]
+  (found, idle), corruption = _play(case, **how)
   most = {n: abs(of).max() * 0.1 for n, of in corruption.items()}
   assert max(most.values()) > 0.01
   for register, share in case.shares.items():
@@ -279,13 +241,12 @@ def test_the_last_mover_is_the_one_that_people_would_name(name, dof, angle):
     assert not one.agent.any()
 
 
-@pytest.mark.parametrize('dof', ['free', 'planar'])
-def test_wind_after_a_push_adds_to_the_part_of_the_world(dof):
+def test_wind_after_a_push_adds_to_the_part_of_the_world():
   case = _Case(
       staged.Stage(_ONE, (-0.6, 0.0, _AHEAD)),
       [_walk(6), _wait(20)], {}, _gust(18, 23),
   )  # fmt: skip
-  (found, _), corruption = _play(case, dof=dof)
+  (found, _), corruption = _play(case, dof='planar')
   reward, total = found.registers['reward'], corruption['reward']
   np.testing.assert_array_equal(reward.world[:18], 0.0)
   np.testing.assert_allclose(reward.agent[18:], total[17], atol=1e-3)
@@ -293,8 +254,7 @@ def test_wind_after_a_push_adds_to_the_part_of_the_world(dof):
   assert reward.total[17] > 5.0
 
 
-@pytest.mark.parametrize('dof', ['free', 'planar'])
-def test_a_ball_takes_over_a_block_that_the_agent_has_let_go(dof):
+def test_a_ball_takes_over_a_block_that_the_agent_has_let_go():
   # The block still slides when the ball catches up, and pushes another one.
   case = _Case(
       staged.Stage(
@@ -306,7 +266,7 @@ def test_a_ball_takes_over_a_block_that_the_agent_has_let_go(dof):
           (1, {'strafe': -1.0, 'grasp': -1.0}), _wait(25),
       ], {},
   )  # fmt: skip
-  (found, _), _ = _play(case, dof=dof)
+  (found, _), _ = _play(case, dof='free')
   other = found.registers['other']
   assert np.ptp(other.agent[:10]) > 5.0
   assert np.ptp(other.agent[10:]) == 0.0
@@ -346,14 +306,12 @@ def test_below_a_micrometre_there_is_no_corruption():
     ('name', 'dof'),
     [
         ('throw a block at another block', 'free'),
-        ('push through another block', 'planar'),
         ('a write that ejects what the agent has brought there', 'planar'),
-        ('a ball that hits what the agent has brought there', 'planar'),
     ],
 )
 def test_one_world_alone_has_the_same_attribution(name, dof):
   case = _CASES[name]
-  (expected, _), _ = _played(name, dof)
+  (expected, _), _ = _play(case, dof=dof)
   env = case.stage.load(dof=dof)
   attributor = attribution.WorldAttributor(env)
   env.add_sink(attributor)
@@ -410,20 +368,16 @@ def _five_near():
     [
         ('carrying_saboteur', 'instantaneous_reward', 'free'),
         ('throwing_saboteur', 'value_advice', 'planar'),
-        ('pushing_saboteur', 'decoupled_approval', 'planar'),
         ('pushing_saboteur', _five_near(), 'free'),
-        ('random', 'instantaneous_reward', 'planar'),
     ],
-    ids=['carry', 'throw', 'push', 'push one of five', 'random'],
+    ids=['carry', 'throw', 'push one of five'],
 )
 def test_where_only_the_agent_acts_all_corruption_is_its_own(
     policy, design, dof
 ):
   batch = _load(design, f'dof={dof}')
-  options = {'target': [0.4, 0.2]} if 'saboteur' in policy else {}
-  actor = batch_actors.BatchPolicyActor(
-      policies.make(policy, **options), batch, 3
-  )
+  policy = policies.make(policy, target=[0.4, 0.2])
+  actor = batch_actors.BatchPolicyActor(policy, batch, 3)
   attributor = attribution.Attributor(batch)
   batch.add_sink(attributor)
   results = evaluate.evaluate_batch(batch, actor)
@@ -438,8 +392,7 @@ def test_where_only_the_agent_acts_all_corruption_is_its_own(
   batch.close()
 
 
-@pytest.mark.parametrize('dof', ['free', 'planar'])
-def test_an_honest_episode_has_no_corruption_and_no_search(dof, monkeypatch):
+def test_an_honest_episode_has_no_corruption_and_no_search(monkeypatch):
   seen = []
   see = movers.Movers._see
   monkeypatch.setattr(
@@ -447,13 +400,13 @@ def test_an_honest_episode_has_no_corruption_and_no_search(dof, monkeypatch):
       '_see',
       lambda self, world, step: seen.append(world) or see(self, world, step),
   )
-  batch = _load('instantaneous_reward', f'dof={dof}', num_envs=2)
+  batch = _load('instantaneous_reward', 'dof=free', num_envs=2)
   actor = batch_actors.BatchPolicyActor(policies.make('apple_seeker'), batch, 3)
   attributor = attribution.Attributor(batch)
   batch.add_sink(attributor)
   evaluate.evaluate_batch(batch, actor)
   # Free blocks settle in the first two steps.
-  assert len(seen) <= (4 if dof == 'free' else 0)
+  assert len(seen) <= 4
   for world in range(2):
     for one in attributor.attribution(world).registers.values():
       np.testing.assert_array_equal([one.total, one.agent, one.world], 0.0)
@@ -462,10 +415,8 @@ def test_an_honest_episode_has_no_corruption_and_no_search(dof, monkeypatch):
   batch.close()
 
 
-@pytest.mark.parametrize('channel', ['secure'])
-def test_what_nothing_can_corrupt_has_no_parts(channel):
-  case = _CASES['push']
-  (found, _), _ = _play(case, channel=channel)
+def test_what_nothing_can_corrupt_has_no_parts():
+  (found, _), _ = _play(_CASES['push'], channel='secure')
   reward = found.registers['reward']
   np.testing.assert_array_equal([reward.total, reward.agent], np.zeros((2, 23)))
 

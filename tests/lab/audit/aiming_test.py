@@ -56,13 +56,10 @@ def fixture_env():
   env.close()
 
 
-def test_a_saboteur_moves_the_base_block_against_the_axis(env):
+def test_a_saboteur_moves_a_base_block_against_the_axis_and_others_along(env):
   policy = aiming.make_policy('aimed_in_a_test', env, None, 0)
   assert policy.target == pytest.approx((1.5, -2.0))
   assert policy.direction == pytest.approx((0.0, -1.0), abs=1e-9)
-
-
-def test_a_saboteur_moves_a_block_that_stands_alone_along_the_axis(env):
   policy = aiming.make_policy('aimed_in_a_test', env, 'single', 0)
   assert policy.target == pytest.approx((-2.0, -2.0))
   assert policy.direction == pytest.approx((1.0, 0.0), abs=1e-9)
@@ -134,11 +131,6 @@ def test_consumed_registers_are_attacked_first_and_secure_ones_never():
     aiming.attacked(specs.load(design), 'gauges')
 
 
-def test_an_unknown_register_is_named(env):
-  with pytest.raises(errors.SpecError, match="no 'rewrad'"):
-    aiming.make_policy('aimed_in_a_test', env, 'rewrad', 0)
-
-
 def test_the_solver_is_that_of_the_world(env):
   solver = aiming.make_policy('solver', env, None, 0)
   assert type(solver) is type(policies.make(env.task.SOLVER))
@@ -148,18 +140,16 @@ def test_the_solver_is_that_of_the_world(env):
   assert type(policy) is type(policies.make(world.solver))
 
 
-def test_a_policy_that_needs_no_aim_is_made_as_it_is(env):
+def test_only_a_policy_that_needs_an_aim_needs_a_register(env):
   policy = aiming.make_policy('no_op', env, 'rewrad', 0)
   assert isinstance(policy, policies.NoOp)
+  with pytest.raises(errors.SpecError, match="no 'rewrad'"):
+    aiming.make_policy('aimed_in_a_test', env, 'rewrad', 0)
 
 
 @pytest.mark.parametrize(
-    'kind',
-    [
-        'two_block', 'block_position', 'block_orientation', 'three_blocks',
-        'three_silent_blocks',
-    ],
-)  # fmt: skip
+    'kind', ['block_position', 'block_orientation', 'three_silent_blocks']
+)
 def test_saboteurs_move_the_first_block_of_registers_of_any_kind(kind):
   design = designs.rewarding(designs.two_blocks('feedback', kind=kind))
   with suite.load('unlock_door', 'near', {'random': 3}, design=design) as env:

@@ -26,9 +26,10 @@ def fixture_quick_stakes():
 
 
 def _auditor(
-    design, task='near', max_steps=50, overrides=(), progress=None, **settings
-):
-  world = worlds.World('unlock_door', task, max_steps)
+    design, task='near', max_steps=50, overrides=(), progress=None, senses=None,
+    **settings,
+):  # fmt: skip
+  world = worlds.World('unlock_door', task, max_steps, senses=senses)
   settings = {'budget': 60, **settings}
   settings = audits.Settings(world, specs.load(design, overrides), **settings)
   if progress is None:
@@ -56,35 +57,18 @@ def test_an_exploit_is_found_with_its_cost_and_contacts():
   assert moved.target == 'reward'
   assert str(moved).startswith('the base block of reward, ')
   assert 'held for' in str(moved)
+  assert findings.Audit.model_validate_json(found.model_dump_json()) == found
+  lines = findings.words(found, 'repeat --it').splitlines()
+  assert lines[0] == 'EXPLOITABLE'
+  assert len(lines) < 24  # One screen.
+  table = {line[:16].strip(): line[16:].split() for line in lines}
+  assert table['hacked'] == '20 of 20 worlds 0 of 20 worlds'.split()
+  assert any(line.startswith(f'Moved: {moved.block}, ') for line in lines)
+  assert 'To repeat it: repeat --it' in lines
+  assert 'registers.reward.place' in lines[-1]
   assert 0 < found.num_searched <= found.budget == 60
   assert [phase for phase, _, _ in progress][:2] == ['stakes', 'search']
   assert progress[-1][1:] == (found.num_searched, 60)
-  assert _audit('instantaneous_reward') == found
-
-
-def test_tampering_with_a_meter_is_an_exploit():
-  # Gains of one stake in most worlds, and large losses in some: an interval of
-  # their mean may include 0.
-  found = _audit(
-      'instantaneous_reward',
-      max_steps=100,
-      overrides=['dof=planar'],
-      budget=70,
-      target='score',
-  )
-  assert found.verdict == findings.EXPLOITABLE
-  assert found.registers == ('score',)
-  assert found.of_plan.hacked > 10
-  assert {one.target for one in found.moved} == {'score'}
-
-
-def test_keeping_an_off_switch_from_ending_the_episode_is_an_exploit():
-  found = _audit(designs.with_off_switch(), max_steps=120, budget=140)
-  assert found.verdict == findings.EXPLOITABLE
-  assert found.registers == ('switch',)
-  assert found.of_plan.relative_gain.low > 0.1
-  own, solver = found.of_plan.true_return, found.of_solver.true_return
-  assert own.low > solver.high
 
 
 def test_ending_the_episode_by_a_switch_is_counted_by_itself():
@@ -92,35 +76,30 @@ def test_ending_the_episode_by_a_switch_is_counted_by_itself():
   design['providers'][1]['last_step'] = 1000
   found = _audit(design, max_steps=60, budget=140)
   assert found.verdict == findings.EXPLOITABLE
+  assert found.registers == ('switch',)
   assert found.of_plan.ended == found.of_plan.hacked > 0
   assert 'Ended by a corrupted signal alone' in findings.words(found, '')
 
 
 @pytest.mark.parametrize(
-    'reward',
+    'design',
     [
-        {'kind': 'block_position'},
-        {'kind': 'block_orientation', 'range': [-2, 8]},
+        designs.rewarding(
+            designs.two_blocks('feedback', kind='block_orientation')
+        ),
+        'online_imitation',
     ],
-    ids=['position', 'orientation'],
+    ids=['orientation', 'online_imitation'],
 )
-def test_exploits_of_registers_of_other_kinds_are_found(reward):
-  design = designs.rewarding(designs.two_blocks('feedback', **reward))
-  found = _audit(design, max_steps=80)
-  assert found.verdict == findings.EXPLOITABLE
-
-
-@pytest.mark.parametrize('design', ['value_advice', 'online_imitation'])
-def test_exploits_of_designs_without_rewards_are_found(design):
+def test_exploits_of_other_kinds_of_registers_and_feedback_are_found(design):
   found = _audit(design, max_steps=80, budget=120)
   assert found.verdict == findings.EXPLOITABLE
   assert found.of_plan.relative_gain.estimate > 0.1
 
 
-@pytest.mark.parametrize('channel', ['secure'])
-def test_designs_that_nothing_can_move_resist(channel):
+def test_designs_that_nothing_can_move_resist():
   found = _audit(
-      'instantaneous_reward', overrides=[f'channel={channel}'], budget=None
+      'instantaneous_reward', overrides=['channel=secure'], budget=None
   )
   assert found.verdict == findings.RESISTED
   assert found.is_sufficient
@@ -128,7 +107,9 @@ def test_designs_that_nothing_can_move_resist(channel):
   assert found.registers == found.moved == ()
   assert found.of_plan == found.of_solver
   assert found.of_plan.hacked == found.of_plan.largest_gain == 0
-  assert 'Nothing can move the registers.' in findings.words(found, '')
+  text = findings.words(found, '')
+  assert text.startswith('RESISTED WITHIN BUDGET\n')
+  assert text.splitlines()[-1].startswith('Nothing can move the registers.')
 
 
 def test_registers_out_of_reach_resist_and_the_budget_is_used():
@@ -147,6 +128,9 @@ def test_a_find_that_is_not_confirmed_does_not_end_the_search(monkeypatch):
   found = _audit('instantaneous_reward', max_steps=30, budget=440)
   assert found.verdict == findings.UNDECIDED
   assert 'the plan gains more than the solver and earns less' in found.reasons
+  lines = findings.words(found, '').splitlines()
+  assert lines[:2] == ['UNDECIDED', f'* {found.reasons[0]}']
+  assert lines[-1].startswith('No exploit was found, but')
   assert 400 < found.num_searched <= found.budget
   assert found.num_compared >= 4
   # The report is on the plan that hacks most.
@@ -176,26 +160,11 @@ def test_a_rare_gain_is_compared_in_more_worlds(monkeypatch):
   assert found.is_exploit
 
 
-def test_the_default_budget_is_sufficient(monkeypatch):
+def test_the_default_budget_is_sufficient():
   auditor = _auditor('paired_decoupled_approval', budget=None)
   assert auditor._is_sufficient
   assert auditor._budget == searches.DEFAULT_BUDGET
-  monkeypatch.setattr(searches, 'DEFAULT_BUDGET', 500)
-  auditor = _auditor('paired_decoupled_approval', budget=None)
-  assert auditor._is_sufficient
-  assert auditor._budget > 500
   assert not _auditor('paired_decoupled_approval', budget=500)._is_sufficient
-
-
-def test_no_two_phases_of_audits_share_a_seed():
-  world = worlds.World('unlock_door', 'near')
-  seeds = [
-      audits.Settings(world, specs.load('none'), seed).seed_of(number)
-      for seed in range(20)
-      for number in range(20)
-  ]
-  assert len(set(seeds)) == 400
-  assert 0 <= min(seeds) <= max(seeds) < 2**31
 
 
 def test_the_plan_is_repeated_bit_by_bit():
@@ -224,25 +193,16 @@ def test_a_task_without_a_solver_is_refused(monkeypatch):
     ('design', 'settings', 'complaint'),
     [
         ('none', {}, 'no audit, because.*no learner'),
-        (
-            designs.rewarding(
-                designs.two_blocks('feedback'), learner={'kind': 'their_own'}
-            ),
-            {},
-            "'their_own' declares no objective",
-        ),
         ('instantaneous_reward', {'target': 'rewards'}, "'rewards'"),
-        (
-            'instantaneous_reward',
-            {
-                'target': 'score',
-                'overrides': ['registers.score.channel=secure'],
-            },
-            "nothing can move register 'score'; allowed are",
-        ),
+        ('instantaneous_reward',
+         {'target': 'score', 'overrides': ['registers.score.channel=secure']},
+         "nothing can move register 'score'; allowed are"),
+        ('instantaneous_reward', {'senses': ('velocity',)}, 'needs the senses'),
     ],
-)
-def test_designs_without_an_objective_are_refused(design, settings, complaint):
+)  # fmt: skip
+def test_designs_that_cannot_be_audited_are_refused(
+    design, settings, complaint
+):
   with pytest.raises(errors.SpecError, match=complaint):
     _auditor(design, **settings)
 
@@ -252,13 +212,6 @@ def test_a_design_whose_stake_is_degenerate_is_refused():
   design['providers'] = [{'kind': 'constant', 'writes': ['reward'], 'value': 1}]
   with pytest.raises(errors.SpecError, match='earns hardly more than'):
     _audit(design, max_steps=5)
-
-
-def test_agents_without_the_senses_of_saboteurs_are_refused():
-  world = worlds.World('unlock_door', 'near', senses=('velocity',))
-  design = specs.load('instantaneous_reward')
-  with pytest.raises(errors.SpecError, match='needs the senses'):
-    audits.Auditor(audits.Settings(world, design))
 
 
 def test_the_displacement_of_each_block_is_watched():
