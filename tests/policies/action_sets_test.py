@@ -10,7 +10,6 @@ from realab_suite import suite
 from realab_suite.engine import batch_environment
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import batch_actors
-from realab_suite.lab import agents
 from realab_suite.policies import action_sets
 from realab_suite.policies import macros
 from realab_suite.tasks import collect_apples
@@ -70,21 +69,6 @@ def test_versions_of_an_own_set_act_side_by_side():
     )
 
 
-def test_a_learner_acts_with_an_own_set():
-  action_sets.register(_drive())
-  batch = _load(1, num_envs=2)
-  learner = agents.make(
-      batch.mechanism.design.learner, batch.observation_spec(),
-      batch.action_spec(), num_envs=2, seed=0,
-  )  # fmt: skip
-  time_step = batch.reset()
-  for _ in range(3):
-    actions = learner.step(time_step)
-    assert set(actions.tolist()) <= {0, 1, 2}
-    time_step = batch.step(actions)
-  assert learner.probabilities(time_step.observation).shape == (2, 3)
-
-
 class _Turner(policies.Policy):
   """Takes the action 1 of the set `drive`."""
 
@@ -116,8 +100,7 @@ def test_a_set_contains_what_sets_the_same_elements():
   assert not first.contains(_drive(5, (('ahead', {'forward': 0.5}),), 'third'))
 
 
-@pytest.mark.parametrize('num_envs', [0, 2])
-def test_the_apple_seeker_walks_where_it_can_only_walk(num_envs):
+def test_the_apple_seeker_walks_where_it_can_only_walk():
   walk, everything = action_sets.WALK, action_sets.DMLAB_LIKE
   assert len(walk) == 9
   assert walk.rest == 0
@@ -133,12 +116,8 @@ def test_the_apple_seeker_walks_where_it_can_only_walk(num_envs):
     }
     where = ('unlock_door', 'near', {'random': 1})
     seeker = policies.make('apple_seeker')
-    if num_envs:
-      env = suite.load_batch(*where, num_envs=num_envs, **options)
-      actor = batch_actors.BatchPolicyActor(seeker, env, 1)
-    else:
-      env = suite.load(*where, **options)
-      actor = actors.make(seeker, env)
+    env = suite.load_batch(*where, num_envs=2, **options)
+    actor = batch_actors.BatchPolicyActor(seeker, env, 1)
     given = action_sets.get(name, version)
     time_step, chosen = env.reset(), []
     for _ in range(40):
@@ -211,11 +190,6 @@ def test_plans_include_the_actions_of_a_solver_that_they_lack():
   assert _controls(env, action) == _ACTIONS[1][1]
 
 
-def test_a_set_without_rest_has_no_action_that_waits():
-  with pytest.raises(errors.SpecError, match='drive v1: has no action'):
-    _drive().rest  # noqa: B018
-
-
 def test_a_set_is_registered_once():
   action_sets.register(_drive())
   with pytest.raises(errors.SpecError, match="'drive v1' is registered"):
@@ -227,11 +201,8 @@ def test_a_set_is_registered_once():
 @pytest.mark.parametrize(
     ('change', 'complaint'),
     [
-        ({'name': 'Drive'}, "name: 'Drive'; allowed are names"),
-        ({'name': 'a/v1'}, 'allowed are names'),
-        ({'name': 3}, 'allowed are names'),
+        ({'name': 'a/v1'}, "name: 'a/v1'; allowed are names"),
         ({'version': 0}, 'version: 0; allowed are integers from 1'),
-        ({'version': True}, 'allowed are integers from 1'),
         ({'actions': ()}, 'actions: []; allowed are one or more'),
         ({'actions': _ACTIONS[:1] * 2}, "actions: ['grasp', 'grasp']"),
         ({'actions': (('go', {'forward': np.nan}),)}, 'allowed are finite'),

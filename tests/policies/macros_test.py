@@ -127,13 +127,6 @@ def test_a_throw_ends_with_the_release_and_other_blocks_are_let_go():
   ]
 
 
-def test_a_plan_that_only_does_the_task_is_the_solver():
-  env, blocks = _world()
-  own, _ = _actions(env, _policy(macros.of_solver(), env, blocks))
-  assert own == _actions(env, policies.make('apple_seeker'))[0]
-  assert macros.of_solver().words([]) == ['do the task']
-
-
 def test_a_block_is_moved_before_the_task_is_done():
   env, blocks = _world()
   plan = macros.then_solve(macros.of_saboteur('carry', 0, np.pi), 5)

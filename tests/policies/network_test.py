@@ -1,11 +1,9 @@
 """Tests for network policies: their files, outputs and returns."""
 
 from collections.abc import Mapping
-import dataclasses
 import io
 import json
 import pathlib
-import zipfile
 
 import numpy as np
 import pytest
@@ -28,10 +26,6 @@ _DIGESTS = {
         '2fb22618e297fb026e89698e58509269d7ffe2b5de669562212d1bfc3e5bb840'
     ),
 }
-_CHOOSE = (
-    ('online_imitation', 'providers.0.policy=network_demonstrator'),
-    ('paired_decoupled_approval', 'providers.0.value_function=network_values'),
-)
 
 
 @pytest.fixture(scope='module', name='shipped')
@@ -123,18 +117,14 @@ def test_a_shipped_network_reaches_its_return(shipped):
   assert (returns >= 10).mean() >= 0.8
 
 
-@pytest.mark.parametrize('size', [3, 256])
-def test_outputs_do_not_depend_on_the_other_worlds_of_a_batch(
-    shipped, views, size
-):
+def test_outputs_do_not_depend_on_the_other_worlds_of_a_batch(shipped, views):
   expected = np.stack(
       [
           network_policies.outputs(shipped, _worlds(views, i), ())
           for i in range(256)
       ]
   )
-  starts = range(0, 256, size)
-  parts = [_worlds(views, slice(i, i + size)) for i in starts]
+  parts = [_worlds(views, slice(i, i + 3)) for i in range(0, 256, 3)]
   got = [
       network_policies.outputs(shipped, part, part['senses/time_left'].shape)
       for part in parts
@@ -187,55 +177,11 @@ def test_the_demonstrator_takes_the_action_with_the_best_advice(shipped, views):
   assert len(np.unique(action)) > 3
 
 
-def test_equal_outputs_give_all_actions_the_best_advice(shipped, views):
-  silent = dataclasses.replace(
-      shipped,
-      weights=tuple(np.zeros_like(w) for w in shipped.weights),
-      biases=tuple(np.zeros_like(b) for b in shipped.biases),
-  )
-  values, _ = policies.NetworkValues(silent).step(
-      views, np.ones(256, bool), _KEY, ()
-  )
-  np.testing.assert_array_equal(values, 1)
-
-
-@pytest.mark.parametrize(('design', 'override'), _CHOOSE)
-def test_a_network_gives_equal_feedback_in_one_world_and_a_batch(
-    design, override
-):
-  options = {
-      'environment_kwargs': {'max_steps': 25},
-      'design': design,
-      'overrides': ('dof=planar', override),
-  }
-  task = ('unlock_door', 'near', {'random': 4})
-  batch = suite.load_batch(*task, num_envs=3, **options)
-  rng = np.random.default_rng(1)
-  spec = batch.action_spec()
-  high = np.broadcast_to(getattr(spec, 'maximum', 13), (25, 3, *spec.shape))
-  actions = rng.integers(0, high, endpoint=True).astype(spec.dtype)
-  seen = [batch.reset().observation]
-  seen += [batch.step(action).observation for action in actions]
-  batch.close()
-  options['environment_kwargs']['world'] = 2
-  env = suite.load(*task, **options)
-  alone = [env.reset().observation]
-  alone += [env.step(action[2]).observation for action in actions]
-  env.close()
-  (register,) = {name for name in alone[0] if name.startswith('registers/')}
-  assert len({float(one[register]) for one in alone}) > 3
-  for many, one in zip(seen, alone, strict=True):
-    for name, value in one.items():
-      assert np.asarray(many[name][2]).tobytes() == value.tobytes()
-
-
 @pytest.mark.parametrize(
     ('weights', 'complaint'),
     [
         ('demonstrator_v0', r"neither a file nor one of \['demonstrator_v1'"),
-        ('no/such/file.npz', 'neither a file'),
         (3, 'allowed are a path'),
-        (None, 'allowed are a path'),
     ],
 )
 def test_unknown_weights_are_refused(weights, complaint):
@@ -245,14 +191,10 @@ def test_unknown_weights_are_refused(weights, complaint):
 
 _ARRAYS = [
     ({'weight_1': np.zeros((64, 63), np.float32)}, r'\(64, 63\)'),
-    ({'weight_1': np.zeros((64, 64))}, "float32 of shapes .*'bias_1'.*header"),
-    ({'weight_9': np.zeros(3)}, "contains .*'weight_9'"),
     ({'weight_0': None}, 'its header describes'),
     ({'bias_0': np.full(64, np.nan, np.float32)}, 'finite float32'),
     ({'bias_0': np.ones(64, np.float32)}, 'damaged: SHA-256'),
     ({'bias_0': np.array([object()])}, 'not a network: .*allow_pickle'),
-    ({'header': np.zeros(4)}, 'not a network: '),
-    ({'header': np.frombuffer(b'3', np.uint8)}, 'not a network: '),
     ({'header': np.frombuffer(b'{}', np.uint8)}, 'required key is missing'),
     # Large only when it is unpacked.
     ({'filler': np.zeros(2**20)}, 'larger than'),
@@ -268,14 +210,6 @@ def test_a_file_with_other_arrays_is_refused(shipped, change, complaint):
   assert len(buffer.getvalue()) < 2**18
   with pytest.raises(errors.SpecError, match=complaint):
     network_files.from_bytes(buffer.getvalue(), 'net.npz')
-
-
-@pytest.mark.parametrize('cut', [0, 1000, -1])
-def test_a_truncated_file_is_refused(shipped, tmp_path, cut):
-  path = tmp_path / 'net.npz'
-  path.write_bytes(shipped.to_bytes()[:cut])
-  with pytest.raises(errors.SpecError, match='not a network'):
-    network_files.load(path)
 
 
 def test_a_file_with_any_changed_byte_is_refused_or_the_same(shipped):
@@ -294,21 +228,6 @@ def test_a_file_with_any_changed_byte_is_refused_or_the_same(shipped):
   assert refused > 50
 
 
-def test_a_large_file_is_refused(tmp_path):
-  path = tmp_path / 'net.npz'
-  path.write_bytes(bytes(2**22 + 1))
-  with pytest.raises(errors.SpecError, match='larger than'):
-    network_files.load(path)
-
-
-def test_an_archive_of_something_else_is_refused(tmp_path):
-  path = tmp_path / 'net.npz'
-  with zipfile.ZipFile(path, 'w') as archive:
-    archive.writestr('note.txt', 'nothing to learn here')
-  with pytest.raises(errors.SpecError, match='not a network'):
-    network_files.load(path)
-
-
 @pytest.mark.parametrize(
     ('change', 'complaint'),
     [
@@ -325,15 +244,6 @@ def test_a_changed_header_is_refused(shipped, change, complaint):
   np.savez(buffer, **arrays)
   with pytest.raises(errors.SpecError, match=complaint):
     network_files.from_bytes(buffer.getvalue(), 'net.npz')
-
-
-def test_a_header_with_too_few_features_is_refused(shipped):
-  header = shipped.header.model_copy(
-      update={'features': shipped.header.features[1:]}
-  )
-  data = dataclasses.replace(shipped, header=header).to_bytes()
-  with pytest.raises(errors.SpecError, match='weight_0'):
-    network_files.from_bytes(data, 'net.npz')
 
 
 @pytest.mark.parametrize(('change', 'complaint'), [
