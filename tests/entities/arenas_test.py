@@ -1,6 +1,5 @@
 """Rooms keep everybody in, and offer places that are inside."""
 
-import mujoco
 import numpy as np
 import pytest
 
@@ -25,44 +24,6 @@ def _with_avatar(arena):
   return physics, avatar
 
 
-# ---- Rectangles --------------------------------------------------------------
-
-
-def test_a_rectangle_contains_what_is_inside_it():
-  rectangle = arenas.Rectangle((-1.0, 0.0), (2.0, 3.0))
-  assert rectangle.contains((0.5, 1.0))
-  assert rectangle.contains((-1.0, 3.0))
-  assert not rectangle.contains((2.1, 1.0))
-  assert not rectangle.contains((0.0, -0.1))
-  assert not rectangle.contains((9.0, 9.0))
-
-
-def test_a_margin_keeps_away_from_every_side():
-  rectangle = arenas.Rectangle((-1.0, 0.0), (2.0, 3.0))
-  assert rectangle.contains((1.5, 2.5), margin=0.5)
-  for point in [(-0.6, 1.0), (1.6, 1.0), (1.0, 0.4), (1.0, 2.6)]:
-    assert rectangle.contains(point)
-    assert not rectangle.contains(point, margin=0.5)
-
-
-# ---- Places ------------------------------------------------------------------
-
-
-@every_room
-def test_every_place_is_inside(room):
-  arena = _ROOMS[room]()
-  assert len(arena.places) >= 9
-  for name, place in arena.places.items():
-    assert arena.extent.contains(place.position), name
-
-
-def test_a_place_can_be_offered():
-  arena = arenas.OpenRoom()
-  place = arenas.Place((1.0, 2.0), 0.5, (0.1, 0.1))
-  arena.offer({'station': place})
-  assert arena.places['station'] == place
-
-
 def test_a_place_cannot_be_offered_twice():
   arena = arenas.OpenRoom()
   before = dict(arena.places)
@@ -74,12 +35,9 @@ def test_a_place_cannot_be_offered_twice():
 @pytest.mark.parametrize(
     ('key', 'values'),
     [
-        (
-            'position',
-            [(0.0,), (0, 1, 2), 3.0, 'centre', (0, np.nan), (0, 'x'), None],
-        ),
-        ('yaw', [np.inf, None, (0.0, 0.0)]),
-        ('spread', [(0.1, -0.1), 0.1, (0.1,), (np.nan, 0.0)]),
+        ('position', [(0.0,), 'centre', (0, np.nan), None]),
+        ('yaw', [np.inf, None]),
+        ('spread', [(0.1, -0.1), 0.1]),
     ],
 )
 def test_an_invalid_place_is_rejected(key, values):
@@ -88,17 +46,14 @@ def test_an_invalid_place_is_rejected(key, values):
       arenas.Place(**{'position': (0.0, 0.0), key: value})
 
 
-# ---- Walls -------------------------------------------------------------------
-
-
 @every_room
 def test_an_avatar_that_runs_about_stays_inside(room):
   arena = _ROOMS[room]()
   physics, avatar = _with_avatar(arena)
   random_state = np.random.RandomState(0)
-  for _ in range(15):
-    forward, strafe = random_state.choice([-1.0, 0.0, 1.0], 2)
-    turn = random_state.uniform(-0.3, 0.3)
+  for _ in range(12):
+    forward, strafe = random_state.choice([-1.0, 1.0], 2)
+    turn = random_state.uniform(-0.2, 0.2)
     for _ in range(10):
       worlds.act(avatar, physics, 10, forward=forward, strafe=strafe, turn=turn)
       assert arena.extent.contains(
@@ -106,28 +61,12 @@ def test_an_avatar_that_runs_about_stays_inside(room):
       )
 
 
-@every_room
-def test_an_avatar_that_runs_at_a_wall_stays_inside(room):
-  arena = _ROOMS[room]()
-  physics, avatar = _with_avatar(arena)
-  for angle in np.linspace(0, 2 * np.pi, 8, endpoint=False):
-    avatar.place(physics, (0.0, 0.0), angle)
-    for _ in range(40):
-      # Both motors at once push hardest.
-      worlds.act(avatar, physics, 10, forward=1.0, strafe=1.0)
-      assert arena.extent.contains(
-          avatar.position(physics), avatar.radius - _GIVES
-      )
-
-
-@every_room
 @pytest.mark.parametrize(
     ('size', 'mass', 'is_guarded'),
-    [(0.06, 0.01, True), (0.2, 1.0, True), (1.0, 100.0, True),
-     (0.2, 1.0, False)],
-)  # fmt: skip
-def test_no_block_flies_out_of_the_room(room, size, mass, is_guarded):
-  arena = _ROOMS[room]()
+    [(0.06, 0.01, True), (1.0, 100.0, True), (0.2, 1.0, False)],
+)
+def test_no_block_flies_out_of_the_room(size, mass, is_guarded):
+  arena = arenas.TwoRooms()
   register = registers.BlockPositionRegister(
       'r', value_range=(0, 1), block_size=size, mass=mass
   )
@@ -138,12 +77,10 @@ def test_no_block_flies_out_of_the_room(room, size, mass, is_guarded):
   (block,) = register.blocks
   worlds.fit_substeps(arena, [block])
   physics = worlds.compile_world(arena)
-  starts = [(0.0, 0.0), (2.5, -2.5)]
-  if 'side_room' in arena.places:
-    starts.append(arena.places['side_room'].position)
+  starts = [(0.0, 0.0), (2.5, -2.5), arena.places['side_room'].position]
   rng = np.random.default_rng(0)
   highest, num_outside = 0.0, 0
-  for start in starts * 4:
+  for start in starts * 3:
     with physics.reset_context():
       block.put(physics, np.array([*start, 0.6]), rng.uniform(0, np.pi))
     up, along = rng.uniform(3.0, 10.0, 2)
@@ -159,11 +96,10 @@ def test_no_block_flies_out_of_the_room(room, size, mass, is_guarded):
   assert (num_outside == 0) is is_guarded
 
 
-@pytest.mark.parametrize('dof', ['free', 'planar'])
-def test_a_small_block_that_is_forced_into_a_wall_comes_back(dof):
+def test_a_small_block_that_is_forced_into_a_wall_comes_back():
   arena = arenas.OpenRoom()
   register = registers.BlockPositionRegister(
-      'r', value_range=(0, 1), block_size=0.06, mass=0.01, dof=dof
+      'r', value_range=(0, 1), block_size=0.06, mass=0.01
   )
   register.attach_to(arena, (0.0, 0.0))
   physics = worlds.compile_world(arena)
@@ -198,7 +134,7 @@ def test_no_ray_leaves_the_room(room):
   low, high = np.array(arena.room.low), np.array(arena.room.high)
   starts = [
       low + (high - low) * np.array(fraction)
-      for fraction in np.random.RandomState(0).uniform(0.1, 0.9, (20, 2))
+      for fraction in np.random.RandomState(0).uniform(0.1, 0.9, (8, 2))
   ]
   if 'side_room' in arena.places:
     starts.append(arena.places['side_room'].position)
@@ -208,41 +144,6 @@ def test_no_ray_leaves_the_room(room):
       assert (
           avatar.rays.classes(physics) == appearance.code('wall')
       ).all(), start
-
-
-def test_the_rooms_meet_in_a_doorway_of_the_width_that_is_asked_for():
-  arena = arenas.TwoRooms(doorway_width=1.0)
-  assert arena.doorway_width == 1.0
-  physics, avatar = _with_avatar(arena)
-  y = arena.places['doorway'].position[1]
-  avatar.place(physics, (0.0, y), 0.0)
-  rays = avatar.rays
-  distances = rays.distances(physics)
-  ahead = distances[np.abs(rays.angles).argmin()]
-  assert ahead == pytest.approx(0.5, abs=1e-6)
-
-
-@every_room
-def test_the_size_of_the_room_is_as_asked_for(room):
-  arena = _ROOMS[room](half_width=2.5)
-  assert arena.room == arenas.Rectangle((-2.5, -2.5), (2.5, 2.5))
-  physics, avatar = _with_avatar(arena)
-  rays = avatar.rays
-  ahead = np.abs(rays.angles).argmin()
-  for angle in (0.0, np.pi, -np.pi / 2):
-    avatar.place(physics, (0.0, 0.0), angle)
-    assert rays.distances(physics)[ahead] == pytest.approx(2.5, abs=1e-6)
-
-
-@every_room
-def test_walls_are_too_thick_to_tunnel_through(room):
-  # At least 5 cm.
-  arena = _ROOMS[room]()
-  arena.add_barrier('barrier', (0.0, 0.0), (1.0, 0.0))
-  model = worlds.compile_world(arena).model
-  boxes = model.geom_type == mujoco.mjtGeom.mjGEOM_BOX
-  assert boxes.sum() >= 5
-  assert (2 * model.geom_size[boxes]).min() >= 0.05
 
 
 def test_a_barrier_stops_an_avatar_and_not_its_view():
@@ -258,15 +159,3 @@ def test_a_barrier_stops_an_avatar_and_not_its_view():
   barrier = physics.bind(arena.mjcf_model.find('geom', 'barrier'))
   top = barrier.xpos[2] + barrier.size[2]
   assert physics.bind(avatar.camera).xpos[2] > top
-
-
-# ---- Physics -----------------------------------------------------------------
-
-
-@every_room
-def test_the_solver_does_not_couple_distant_bodies(room):
-  # Campaign C13: only Newton and CG solve islands one by one.
-  options = worlds.compile_world(_ROOMS[room]()).model.opt
-  assert options.solver == mujoco.mjtSolver.mjSOL_NEWTON
-  assert options.noslip_iterations == 0
-  assert not options.disableflags & mujoco.mjtDisableBit.mjDSBL_ISLAND

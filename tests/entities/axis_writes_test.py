@@ -37,8 +37,8 @@ def _tumble(world: avatar_worlds.World) -> None:
 
 @every_dof
 @every_kind
-@pytest.mark.parametrize('value', [0.0, 5.5])
-def test_a_write_leaves_everything_else_as_it_is(kind, dof, value):
+def test_a_write_leaves_everything_else_as_it_is(kind, dof):
+  value = 5.5
   world = _make(kind, dof=dof, yaw=0.7)
   _tumble(world)
   physics, block = world.physics, _written(world.register)
@@ -64,8 +64,9 @@ def test_a_write_leaves_everything_else_as_it_is(kind, dof, value):
     np.testing.assert_array_equal(after['matrix'], before['matrix'])
 
 
-@pytest.mark.parametrize('axis', np.eye(3)[:2].tolist())
-@pytest.mark.parametrize('quarters', [0, 1, 2, 3])
+@pytest.mark.parametrize(
+    ('axis', 'quarters'), [((1, 0, 0), 1), ((0, 1, 0), 2), ((0, 1, 0), 3)]
+)
 def test_a_toppled_block_at_rest_holds_its_orientation(axis, quarters):
   # A heading that is undefined for one of these faces would read noise there.
   world = _make('block_orientation', dof='free')
@@ -90,8 +91,9 @@ def _pose(physics: Any, block: Any) -> dict[str, np.ndarray]:
   }
 
 
-@every_dof
-@pytest.mark.parametrize('kind', ['two_block', 'block_position'])
+@pytest.mark.parametrize(
+    ('kind', 'dof'), [('two_block', 'free'), ('block_position', 'planar')]
+)
 def test_a_held_block_can_be_written_and_carried(kind, dof):
   world = _make(kind, dof=dof, yaw=0.0)
   physics, register = world.physics, world.register
@@ -129,7 +131,7 @@ def test_a_held_block_can_be_written_and_carried(kind, dof):
 @every_dof
 def test_a_block_that_returns_to_the_hand_does_not_rush(dof):
   speeds = {}
-  for value in (-12.0, -4.0, 4.0, 12.0):
+  for value in (-12.0, 4.0):
     world = _make('block_position', dof=dof)
     world.grasp()
     world.register.write(world.physics, value)
@@ -140,24 +142,6 @@ def test_a_block_that_returns_to_the_hand_does_not_rush(dof):
       speeds[value] = max(speeds[value], world.fastest)
   assert max(speeds.values()) <= 2.0
   assert min(speeds.values()) > 0.3
-
-
-@every_dof
-def test_a_write_carries_no_energy(dof):
-  world = _make('block_position', dof=dof)
-  physics, register = world.physics, world.register
-  world.place(-3.0, -3.0)
-  world.act(100)
-  rng = np.random.default_rng(0)
-  for _ in range(200):
-    register.write(physics, rng.uniform(-20, 20))
-    before = float(np.sum(np.square(physics.data.qvel)))
-    world.act(2)
-    assert float(np.sum(np.square(physics.data.qvel))) <= before + 1e-9
-  assert np.abs(physics.data.qvel).max() < 1e-3
-
-
-# ---- Obstructions ------------------------------------------------------------
 
 
 def _room(
@@ -174,8 +158,9 @@ def _room(
   return physics, register
 
 
-@every_dof
-@pytest.mark.parametrize('yaw', [0.0, math.pi / 2, 0.4])
+@pytest.mark.parametrize(
+    ('dof', 'yaw'), [('free', 0.0), ('planar', math.pi / 2), ('free', 0.4)]
+)
 def test_a_block_written_into_a_barrier_gets_the_nearest_free_place(dof, yaw):
   physics, register = _room(yaw, dof)
   (block,) = register.blocks
@@ -224,39 +209,15 @@ def _depth(physics: Any, block: Any) -> float:
   return deepest
 
 
-@pytest.mark.parametrize('y', [4.6, 5.5, 6.6])
-def test_a_block_carried_to_another_room_stays_in_it(y):
+def test_a_block_carried_to_another_room_stays_in_it():
   physics, register = _room()
   (block,) = register.blocks
   for value in (-40.0, -14.0, 0.0, 14.0, 40.0):
-    block.put(physics, [0.0, y, block.rest_height])
+    block.put(physics, [0.0, 5.5, block.rest_height])
     register.write(physics, value)
     x = float(block.position(physics)[0])
     assert abs(x) <= 1.3
     assert x == pytest.approx(np.clip(value * _SCALE, -1.25, 1.25), abs=1e-3)
-
-
-def test_obstacles_include_what_the_task_adds():
-  # A wall of a class of its own, on a frame that is turned.
-  arena = arenas.OpenRoom()
-  body = arena.mjcf_model.worldbody.add(
-      'body', pos=(2.0, 1.0, 0.5), euler=(0, 0, 30)
-  )
-  body.add('geom', type='cylinder', size=(0.3, 0.5))
-  register = registers.BlockPositionRegister('r', value_range=(0, 30))
-  register.attach_to(arena, (0.0, 0.0))
-  physics = worlds.compile_world(arena)
-  worlds.start_episode(physics, register)
-  (block,) = register.blocks
-  block.put(physics, [0.0, 1.0, block.rest_height])
-  register.write(physics, 20.5)
-  assert float(register.inspect(physics).obstruction) > 1.0
-  # A cylinder is round: beside it, the corners of the box around it are free.
-  for value, is_obstructed in ((21.0, True), (22.5, False)):
-    block.put(physics, [0.0, 1.33, block.rest_height])
-    register.write(physics, value)
-    obstruction = float(register.inspect(physics).obstruction)
-    assert (obstruction != 0.0) == is_obstructed
 
 
 def test_a_secure_register_is_never_obstructed():

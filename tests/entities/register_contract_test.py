@@ -3,25 +3,18 @@
 `tests/authors/registers_test.py` checks the contract that ships for authors.
 """
 
-from dm_control import mjcf
 import numpy as np
 import pytest
 
 from realab_suite.engine import single_physics
-from realab_suite.entities import arenas
 from realab_suite.entities import registers
 from tests import worlds
 from tests.entities import register_worlds
 
 
-@pytest.fixture(
-    scope='module',
-    name='compiled',
-    params=[mjcf.Physics, single_physics.ThinPhysics],
-    ids=['any_physics', 'our_physics'],
-)
-def fixture_compiled(request):
-  return register_worlds.make_world(request.param)
+@pytest.fixture(scope='module', name='compiled')
+def fixture_compiled():
+  return register_worlds.make_world(single_physics.ThinPhysics)
 
 
 @pytest.fixture(name='world')
@@ -41,40 +34,8 @@ def _shove_everything(world, random_state, register):
     )
 
 
-# ---- Writing and reading -----------------------------------------------------
-
-
-@pytest.mark.parametrize(('value', 'bound'), [(0.0, 1.0), (1.5, 1.5), (4, 3)])
-def test_a_range_without_zero_is_saturated_at_the_nearest_bound(value, bound):
-  arena = arenas.OpenRoom()
-  register = registers.TwoBlockRegister(
-      'positive', value_range=(1.0, 3.0), initial=2.0
-  )
-  register.attach_to(arena, (0.0, 0.0))
-  physics = worlds.compile_world(arena)
-  worlds.start_episode(physics, register)
-  assert register.write(physics, value) == bound
-
-
-def test_a_write_to_one_register_is_no_write_to_another(world):
-  values = {}
-  random_state = np.random.RandomState(0)
-  for name, register in world.registers.items():
-    values[name] = random_state.uniform(
-        register_worlds.LOW, register_worlds.HIGH
-    )
-    register.write(world.physics, values[name])
-  for name, register in world.registers.items():
-    assert register.read(world.physics) == pytest.approx(
-        values[name], abs=register_worlds.ROUNDING
-    )
-
-
-# ---- What happens to a value -------------------------------------------------
-
-
 def test_values_do_not_drift_without_tampering(world):
-  values = [0.0, *np.linspace(register_worlds.LOW, register_worlds.HIGH, 9)]
+  values = [0.0, *np.linspace(register_worlds.LOW, register_worlds.HIGH, 4)]
   worst = dict.fromkeys(world.registers, 0.0)
   for value in values:
     for register in world.registers.values():
@@ -88,7 +49,7 @@ def test_values_do_not_drift_without_tampering(world):
   assert {name: error for name, error in worst.items() if error > 1e-9} == {}
 
 
-@register_worlds.every_variety
+@register_worlds.some_varieties
 def test_corruption_is_reading_minus_applied_value(world, variety):
   register = world.registers[variety.name]
   random_state = np.random.RandomState(0)
@@ -105,24 +66,6 @@ def test_corruption_is_reading_minus_applied_value(world, variety):
           corruption.obstruction, corruption.permanent, corruption.temporary
       )  # fmt: skip
       assert error == pytest.approx(sum(parts), abs=1e-9)
-
-
-@pytest.mark.parametrize('dof', registers.DOFS)
-@register_worlds.every_kind
-def test_the_blocks_of_a_secure_register_are_scenery(world, kind, dof):
-  name = register_worlds.variety_of(kind, 'secure', dof).name
-  register = world.registers[name]
-  register.write(world.physics, 1.1)
-  before = [
-      worlds.world_position(world.physics, block) for block in register.blocks
-  ]
-  _shove_everything(world, np.random.RandomState(0), register)
-  assert register.read(world.physics) == 1.1
-  for block, was in zip(register.blocks, before, strict=True):
-    assert not np.allclose(worlds.world_position(world.physics, block), was)
-
-
-# ---- Twins: the same register over another channel ---------------------------
 
 
 @pytest.mark.parametrize('dof', registers.DOFS)
@@ -146,15 +89,12 @@ def _facing(physics, register):
   return np.array(physics.bind(register.blocks[-1].geom).xmat)
 
 
-# ---- Episodes ----------------------------------------------------------------
-
-
 @pytest.fixture(scope='module', name='scattered')
 def fixture_scattered():
   return register_worlds.make_world(spread=(0.15, 0.05))
 
 
-@register_worlds.every_variety
+@register_worlds.some_varieties
 def test_the_seed_decides_the_place_of_a_scattered_register(scattered, variety):
   register = scattered.registers[variety.name]
   places = []

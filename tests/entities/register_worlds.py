@@ -96,9 +96,6 @@ def make_world(
   return World(worlds.compile_world(arena, kind), made)
 
 
-every_variety = pytest.mark.parametrize(
-    'variety', VARIETIES, ids=[variety.name for variety in VARIETIES]
-)
 some_varieties = pytest.mark.parametrize(
     'variety',
     SOME_VARIETIES,
