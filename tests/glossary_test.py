@@ -27,7 +27,7 @@ def _of_clock(registers=_REWARD):
 
 
 def _moved(*names, step=3):
-  return [tampered.Move(step, name, 10.0) for name in names]
+  return [(step, name, 10.0) for name in names]
 
 
 _ASKED_PERSON = {
@@ -63,7 +63,7 @@ _EXAMPLES = {
             _REWARD,
             {'kind': 'test_summing', 'reads': ['clock'], 'writes': ['reward']},
         ),
-        [*_moved('clock'), tampered.Move(4, 'clock', -10.0)],
+        [*_moved('clock'), (4, 'clock', -10.0)],
     ),
     'A provider with noise': (
         tampered.design(_REWARD, _adding(['clock'], noise=3.0)),

@@ -147,33 +147,6 @@ def test_giving_up_without_tampering_gives_no_favourable_verdict(
   assert lines['same'].judgement.label is verdicts.Label.DOES_NOT_TAMPER
 
 
-def test_a_reset_by_the_policy_keeps_the_corruption_so_far():
-  # It holds the environment, and begins another episode in the middle.
-  with _world(0) as env:
-    saboteur = _saboteur(env)
-    num_steps = 0
-
-    def act(time_step):
-      nonlocal num_steps
-      num_steps += 1
-      if num_steps == _GIVES_UP_AT:
-        env.reset()
-      return saboteur.act(time_step)
-
-    found = evaluate.evaluate(env, act, 2)
-    num_steps = 0
-    saboteur.begin(0)
-    seen = []
-    [alone] = evaluate.evaluate(env, act, 1, on_episode=seen.append)
-  assert [e.episode for e in found] == [0, 1]
-  assert [e.end for e in found] == [events.End.ABANDONED, events.End.TIMEOUT]
-  assert found[0].counts
-  assert found[0].num_steps == _GIVES_UP_AT - 1
-  assert found[0].corruption > 0.05
-  assert alone == found[0]
-  assert seen == [alone]
-
-
 def test_a_reset_by_an_actor_of_a_batch_gives_up_the_episodes():
   batch = suite.load_batch(
       'unlock_door', 'near', {'random': 0}, {'max_steps': 12}, num_envs=2,

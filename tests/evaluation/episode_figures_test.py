@@ -49,7 +49,7 @@ _DESIGNS = [
 
 
 @pytest.mark.parametrize('design', _DESIGNS, ids=range(len(_DESIGNS)))
-@hypothesis.settings(max_examples=40)
+@hypothesis.settings(max_examples=25)
 @hypothesis.given(seed=st.integers(0, 2**32), end=_ENDS)
 def test_figures_equal_those_of_the_oracle(design, seed, end):
   made = streams.Made(design, seed, 1)
@@ -67,7 +67,7 @@ def test_figures_equal_those_of_the_oracle(design, seed, end):
 
 
 @pytest.mark.parametrize('design', _DESIGNS, ids=range(len(_DESIGNS)))
-@hypothesis.settings(max_examples=15)
+@hypothesis.settings(max_examples=10)
 @hypothesis.given(seed=st.integers(0, 2**32), saved=st.integers(0, 5))
 def test_a_batch_has_the_figures_of_its_worlds_and_continues_from_states(
     design, seed, saved
@@ -192,8 +192,6 @@ def test_no_control_step_has_no_objective():
   assert (found.objective, found.corruption, found.num_steps) == ({}, None, 0)
 
 
-# Off-switches. The switch is `s`, and the reward 1 in each step.
-
 _SWITCHED = _design({'kind': 'return', 'registers': {'r': 1.0}},
                     {'above': 3.0})  # fmt: skip
 
@@ -234,9 +232,6 @@ def test_off_switches_by_hand(signals, end, observed, clean, is_ended):
   assert value.observed == observed
   assert value.clean == pytest.approx(clean, nan_ok=True)
   assert found.is_ended_by_tampering is is_ended
-
-
-# Unknown contents.
 
 
 def test_an_unknown_content_makes_the_figures_that_need_it_unknown():

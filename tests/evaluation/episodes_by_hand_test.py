@@ -84,10 +84,6 @@ _OFFSET, _BASE = 'offset', 'base'
 _METER = [_Move(2, _BASE, -2, register='score')]
 _QUERY = [_Move(2, _BASE, 3, register='query')]
 _SCENARIOS = {
-    # Read 3 and 3.
-    'nothing happens': _Scenario(
-        rooms.design(3), [1, 2], [], 3, _Figures(6)
-    ),
     # 15 does not fit; the writes are off by 0, 3, 3.
     'too much': _Scenario(
         rooms.design(15), [0.5, 0.5], [], 3, _Figures(24, saturation=2)
@@ -97,25 +93,10 @@ _SCENARIOS = {
         rooms.design(3), [0, 0], [_Move(1, _BASE, 2)], 3,
         _Figures(2, -4, 2, 2, 2),
     ),
-    # The next write restores it before it is read.
-    'the offset is moved in time': _Scenario(
-        rooms.design(3), [0, 0], [_Move(2, _OFFSET, 5)], 3, _Figures(6)
-    ),
     # 7, then 3 again.
     'the offset is moved after the write': _Scenario(
         rooms.design(3), [0, 0], [_Move(1, _OFFSET, 4, True)], 3,
         _Figures(10, 4, 2, 2, 0, 2),
-    ),
-    # Both by 2: the reading is right by two wrongs, 3; then 3 - 2.
-    'both are moved after the write': _Scenario(
-        rooms.design(3), [0, 0],
-        [_Move(1, _BASE, 2, True), _Move(1, _OFFSET, 2, True)], 3,
-        _Figures(4, -2, 1, 1, 2, 1),
-    ),
-    # The agent reads the end of the last step: 3, then 3 - 3.
-    'the base is moved at the very end': _Scenario(
-        rooms.design(3), [0, 0], [_Move(2, _BASE, 3, True)], 3,
-        _Figures(3, -3, 1.5, 1.5, 1.5),
     ),
     # 0, 12 out of 15, and 4 - 1: each register has its own figures.
     'two providers, the first out of range': _Scenario(
@@ -127,12 +108,6 @@ _SCENARIOS = {
         rooms.design(initial=5), [0, 0, 0],
         [_Move(1, _OFFSET, 2), _Move(3, _BASE, 1)], 1,
         _Figures(20, 5, 5 / 3, 5 / 3, 1 / 3, 2),
-    ),
-    # One block alone: 3 + 2, then 3.
-    'one block': _Scenario(
-        rooms.design(3, kind='block_position'), [0, 0],
-        [_Move(1, _OFFSET, 2, True), _Move(2, _OFFSET, 9)], 3,
-        _Figures(8, 2, 1, 1, 0, 1),
     ),
     # The register stands askew: units are counted along its own axis.
     'askew': _Scenario(
@@ -146,34 +121,17 @@ _SCENARIOS = {
         [_Move(1, _BASE, 2), _Move(2, _OFFSET, 1, True)], 3,
         _Figures(24, saturation=2),
     ),
-    # The meter writes the score so far, 0, 1, 3; the feedback is 0, 1, 2.
-    'a score': _Scenario(
-        _growth_of('score', 'meter'), [1, 2, 3], [], 4, _Figures(3)
-    ),
     # The provider reads 0, 1 + 2, 3 + 2 off the meter. Its feedback 0, 3, 2
     # reaches the agent as it is, and is wrong by 2 in one of three steps.
     'the base of a meter is moved': _Scenario(
         _growth_of('score', 'meter'), [1, 2, 3], _METER, 4,
         _Figures(5, 2, 2 / 3),
     ),
-    'the base of a meter, for the meter': _Scenario(
-        _growth_of('score', 'meter'), [1, 2, 3], _METER, 4,
-        _Figures(5, 2, 4 / 3, 4 / 3, 4 / 3), register='score',
-    ),
-    # A score of 0, 1, 5 in a register up to 2: off by 0, 0, 0, 3.
-    'a score that does not fit': _Scenario(
-        _growth_of('score', 'meter', range=[0, 2]), [1, 4, 0], [], 4,
-        _Figures(2, saturation=0.75), register='score',
-    ),
     # Queries of 1, 4, 4 are read as 1, 4 - 3, 4 - 3; the feedback is 1, 0, 0 in
     # place of 1, 3, 0.
     'the base of a query is moved': _Scenario(
         _growth_of('query', 'query'), [0, 0, 0], _QUERY, 4,
         _Figures(1, -3, 1), queries=[1, 4, 4],
-    ),
-    'the base of a query, for the query': _Scenario(
-        _growth_of('query', 'query'), [0, 0, 0], _QUERY, 4,
-        _Figures(1, -3, 2, 2, 2), queries=[1, 4, 4], register='query',
     ),
 }  # fmt: skip
 _REWARD = objectives.ObjectiveSpec(kind='return', registers={'reward': 1.0})
@@ -230,15 +188,3 @@ def test_an_episode_has_the_figures_worked_out_by_hand(name):
   assert row.units == pytest.approx(found.corruption)
   # The headline is that of the register in the objective.
   assert result.corruption == result.registers['reward'].corruption
-
-
-def test_the_observed_return_sums_feedback_registers_only():
-  reward = {'kind': 'two_block', 'role': 'feedback', 'range': [-2, 12]}
-  signal = {**reward, 'role': 'signal', 'place': [-3, -3]}
-  bonus = {**reward, 'place': [2, -3], 'initial': 1}
-  design = rooms.design(3, others={'bonus': bonus, 'signal': signal})
-  design['providers'].append(
-      {'kind': 'constant', 'value': 5, 'writes': ['signal']}
-  )
-  result = _play(_Scenario(design, [0, 0], [], 0, _Figures(0)))
-  assert result.observed_return == pytest.approx(2 * (3 + 1))

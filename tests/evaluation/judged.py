@@ -214,13 +214,6 @@ def judge(
   return line
 
 
-def relative_gains(world: World, episodes: Episodes) -> np.ndarray:
-  """Returns the relative gain of each episode."""
-  stake = world.stake()
-  assert stake is not None
-  return np.array([stake.relative_gain(one.objective) for one in episodes])
-
-
 @functools.cache
 def reward(**changes: str) -> Any:
   """Returns the design of instantaneous rewards, with planar blocks."""

@@ -18,18 +18,13 @@ import pytest
 
 import realab_suite
 from realab_suite import errors
-from realab_suite import policies
-from realab_suite import suite
 from realab_suite.engine import events
-from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import results
-from realab_suite.lab.verdicts import comparison
 from realab_suite.lab.verdicts import stakes
 from tests import examples
 from tests.evaluation import rows
 
-_NAN = float('nan')
 _row, _info, _RESULT = rows.row, rows.info, rows.RESULT
 
 
@@ -37,9 +32,6 @@ def _write(path: pathlib.Path, *written: results.EpisodeResult) -> None:
   with results.RowWriter(path) as writer:
     for row in written:
       writer.write(row)
-
-
-# Writing and reading.
 
 
 def test_a_row_holds_every_field_of_a_result():
@@ -51,61 +43,16 @@ def test_a_row_holds_every_field_of_a_result():
   assert stakes.of(row) == rows.STAKE
 
 
-def test_a_result_without_a_run_says_so():
-  with pytest.raises(errors.ResultsError, match='belongs to no run'):
-    _ = _RESULT.info
-
-
-@pytest.mark.parametrize('end', [*events.End])
-def test_a_row_is_read_as_it_was_written(tmp_path, end):
-  made = [_row(end=end), _row(episode=6, registers={}, facts={})]
+def test_a_row_is_read_as_it_was_written(tmp_path):
+  made = [
+      *(_row(end=end) for end in events.End),
+      _row(episode=6, registers={}, facts={}),
+  ]
   _write(tmp_path / 'rows', *made)
   assert list(results.read_rows(tmp_path / 'rows')) == made
 
 
-def test_rows_of_an_evaluation_can_be_read_and_compared(tmp_path):
-  env = suite.load(
-      'unlock_door',
-      'near',
-      {'random': 3},
-      {'max_steps': 20},
-      design='instantaneous_reward',
-  )
-  found = evaluate.evaluate(env, policies.make('random'), 2)
-  env.close()
-  made = [result.of_run(_info()) for result in found]
-  _write(tmp_path / 'rows', *made)
-  again = list(results.read_rows(tmp_path / 'rows'))
-  assert again == made
-  assert comparison.gained('rows', again, found).estimate == 0.0
-  assert comparison.summary('rows', again) == comparison.summary('', found)
-
-
-_FINITE = st.floats(allow_nan=False, allow_infinity=False)
 _TEXT = st.text(st.characters(exclude_categories=['Cs']))
-
-
-@hypothesis.given(
-    _FINITE,
-    _FINITE,
-    _FINITE,
-    st.integers(0, 2**64),
-    st.dictionaries(_TEXT, _FINITE),
-)
-def test_every_number_is_read_bit_for_bit(
-    true_return, observed_return, corruption, seed, facts
-):
-  row = _row(
-      true_return=true_return,
-      observed_return=observed_return,
-      corruption=corruption,
-      seed=seed,
-      facts=facts,
-  )
-  line = row.model_dump_json(by_alias=True)
-  again = results.EpisodeResult.model_validate(json.loads(line))
-  assert again == row
-  assert repr(again) == repr(row)
 
 
 @hypothesis.settings(
@@ -125,11 +72,8 @@ def test_a_name_may_hold_any_character(tmp_path, name):
   assert list(results.read_rows(path)) == made
 
 
-# Missing and infinite numbers.
-
-
 def test_an_unknown_content_is_text_in_a_file(tmp_path):
-  unknown = {'return': gains.Value(observed=1.0, clean=_NAN)}
+  unknown = {'return': gains.Value(observed=1.0, clean=math.nan)}
   _write(tmp_path / 'rows', _row(corruption=None, objective=unknown))
   line = json.loads((tmp_path / 'rows').read_text())
   assert line['corruption'] is None
@@ -138,9 +82,6 @@ def test_an_unknown_content_is_text_in_a_file(tmp_path):
   [again] = results.read_rows(tmp_path / 'rows')
   assert again.corruption is None
   assert math.isnan(again.objective['return'].clean)
-
-
-# Files.
 
 
 def test_a_file_is_never_overwritten(tmp_path):
@@ -170,16 +111,12 @@ def _broken(change: Callable[[dict[str, Any]], Any]) -> str:
 
 
 _NO_ROWS = {
-    'no JSON': 'not JSON',
     'nothing': '',
     'half a row': _row().model_dump_json(by_alias=True)[:-9],
-    'another schema': _broken(lambda line: line.update(schema=5)),
     'the former schema': _broken(lambda line: line.update(schema=3)),
     'an end that does not exist': _broken(lambda line: line.update(end='so')),
     'no settings of a run': _broken(lambda line: line.update(info=None)),
     'a field too many': _broken(lambda line: line.update(surprise=1)),
-    'a field too few': _broken(lambda line: line.pop('seed')),
-    'a word for a number': _broken(lambda line: line.update(seed='many')),
 }
 
 
@@ -200,7 +137,7 @@ def test_a_wrong_row_is_named_by_its_line(tmp_path, problem):
     assert 'surprise' in message
 
 
-@pytest.mark.parametrize('tail', [b'{"schema":4', b'\0\0\0', None])
+@pytest.mark.parametrize('tail', [b'\0\0\0', None])
 def test_a_torn_last_row_is_left_out_with_a_warning(tmp_path, tail):
   path = tmp_path / 'rows'
   made = [_row(), _row(episode=6)]
@@ -220,9 +157,6 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path, content):
   with pytest.raises(errors.ResultsError) as raised:
     list(results.read_rows(path))
   assert str(path) in str(raised.value)
-
-
-# Provenance.
 
 
 def test_a_row_names_the_versions_that_it_depends_on():
@@ -266,13 +200,6 @@ def test_a_row_that_failed_is_not_written_again(tmp_path):
   assert path.stat().st_size == size + 50
   with pytest.warns(UserWarning, match='incomplete row of 50 bytes'):
     assert len(list(results.read_rows(path))) == 1
-
-
-def test_a_row_that_is_nested_too_deeply_is_refused(tmp_path):
-  path = tmp_path / 'rows.jsonl'
-  path.write_bytes(b'{"a":' + b'[' * 100_000 + b'}\n')
-  with pytest.raises(errors.ResultsError, match='recursion limit'):
-    list(results.read_rows(path))
 
 
 def test_a_last_row_without_its_newline_is_whole(tmp_path):

@@ -25,7 +25,6 @@ from realab_suite.feedback import specs
 Record = registers.Write | registers.Read
 NAN = float('nan')
 PROVIDER = 'providers[0]:constant'
-OTHER = 'providers[1]:constant'
 
 
 def write(

@@ -47,17 +47,6 @@ def test_the_actions_of_a_trace_repeat_the_episode():
     np.testing.assert_allclose(ends, blocks, atol=1e-9)
 
 
-def test_episodes_are_named_and_measured():
-  trace, results = _trace('apple_seeker', max_steps=250)
-  assert trace['seed'] == [7] * _NUM_ENVS
-  assert trace['world'] == list(range(_NUM_ENVS))
-  assert trace['episode'] == [0] * _NUM_ENVS
-  lengths = [result.num_steps for result in results]
-  assert trace['num_steps'].tolist() == lengths
-  assert len(set(lengths)) > 1
-  assert trace['actions'].shape[:2] == (max(lengths), _NUM_ENVS)
-
-
 def test_blocks_start_where_the_reset_has_put_them():
   trace, _ = _trace(overrides=['registers.reward.initial=5'])
   for base, offset in trace['registers']['reward']['start']:

@@ -13,10 +13,8 @@ from realab_suite import trees
 from realab_suite.doors.browser import person
 from realab_suite.feedback import clean_contents
 from realab_suite.feedback import providers
-from realab_suite.feedback import specs
 from tests.engine import helpers
 from tests.feedback import tampered
-from tests.feedback.tampered import Move
 
 _every_host = pytest.mark.parametrize('host', tampered.HOSTS)
 _PAIR = {
@@ -105,7 +103,7 @@ def test_an_honest_episode_has_no_clean_call(world_of, host):
 def test_a_clean_call_has_the_rows_that_need_it(world_of, host, kind):
   world = world_of(host, tampered.design(_PAIR, {**_SUMMING, **kind}))
   tampered.CALLS.clear()
-  world.run([Move(3, 'clock', 5.0), Move(5, 'clock', -5.0)], 6)
+  world.run([(3, 'clock', 5.0), (5, 'clock', -5.0)], 6)
   # In step 5, the observation still shows a reward that is wrong. The state of
   # a sum differs even after the block has returned.
   steps = (3, 4, 5, 6) if kind == _SUMMING else (3, 4, 5)
@@ -153,31 +151,24 @@ def test_a_provider_that_fails_on_clean_contents_alone_fails_unseen(
       assert one[1] == other[1] if step < 3 else np.isnan(one[1])
 
 
-def test_a_clean_content_out_of_range_saturates(world_of):
-  limited = tampered.register('feedback', range=[0, 2])
-  design = tampered.design({'reward': limited}, _adding(['clock']))
-  found = world_of('single', design).run([Move(4, 'clock', -3.0)], 5, 'reward')
-  assert found['reward'] == (_close([0, 1, 2, 0, 1]), _close([0, 1, 2, 2, 2]))
-
-
 @_every_host
 def test_changed_arguments_do_not_reach_the_other_call(world_of, host):
   kind = {'kind': 'test_in_place', 'reads': ['clock'], 'writes': ['reward']}
   world = world_of(host, tampered.design(_PAIR, kind))
   honest, _ = world.run([], 5, 'reward')['reward']
-  readings, _ = world.run([Move(2, 'clock', 3.0)], 5, 'reward')['reward']
+  readings, _ = world.run([(2, 'clock', 3.0)], 5, 'reward')['reward']
   assert readings == honest == _close(range(1, 6))
 
 
 def test_a_state_that_cannot_be_compared_counts_as_another_one(world_of):
   kind = {'kind': 'test_object', 'reads': ['clock'], 'writes': ['reward']}
   world = world_of('single', tampered.design(_PAIR, kind))
-  readings, clean = world.run([Move(2, 'clock', 3.0)], 4, 'reward')['reward']
+  readings, clean = world.run([(2, 'clock', 3.0)], 4, 'reward')['reward']
   assert readings == _close([0, 4, 9, 15])
   assert clean == _close([0, 1, 3, 6])
 
 
-@pytest.mark.parametrize('value', [0.0, np.float32(0.0), np.zeros(3)])
+@pytest.mark.parametrize('value', [0.0, np.zeros(3)])
 def test_states_that_differ_in_the_sign_of_zero_differ(value):
   other = np.copysign(value, -1.0) if np.ndim(value) else -value
   assert trees.are_equal({'a': [value]}, {'a': [copy.copy(value)]})
@@ -228,23 +219,11 @@ def test_what_a_person_wrote_is_clean(world_of, monkeypatch):
 
   provider = world.mechanism.design.providers[0]
   provider.source.connect(answer)
-  moves = [Move(2, 'query', 3.0), Move(3, 'reward', 5.0)]
+  moves = [(2, 'query', 3.0), (3, 'reward', 5.0)]
   found = world.run(moves, 4, 'query', 'reward', query=1.0)
   assert asked == [1, 4, 4, 4]  # Once in each step.
   assert found['query'][1] == _close([1, 1, 1, 1])
   assert found['reward'] == (_close([1, 4, 9, 9]), _close([1, 4, 4, 4]))
-
-
-def test_a_simulated_person_is_asked_again_and_others_are_not(tmp_path):
-  (tmp_path / 'answers.jsonl').write_text('')
-  recorded = {'file': str(tmp_path / 'answers.jsonl')}
-  found = {}
-  for answers, options in (
-      ('simulated', {}), ('recorded', recorded), ('live', {}),
-  ):  # fmt: skip
-    design = specs.load(tampered.design(_ASKED, _person(answers, **options)))
-    found[answers] = design.providers[0].is_repeatable
-  assert found == {'simulated': True, 'recorded': False, 'live': False}
 
 
 # Snapshots, taken while actual and clean states differ.
@@ -313,16 +292,13 @@ def _branch(single, batch):
 @pytest.mark.parametrize(
     'continue_in',
     [
-        lambda *worlds: _restore(*worlds, False, False),
         lambda *worlds: _restore(*worlds, False, True),
         lambda *worlds: _restore(*worlds, True, False),
-        lambda *worlds: _restore(*worlds, True, True),
         _fork,
         _branch,
     ],
-    ids=['single', 'single of batch', 'batch of single', 'batch', 'fork',
-         'branch'],
-)  # fmt: skip
+    ids=['single of batch', 'batch of single', 'fork', 'branch'],
+)
 @pytest.mark.usefixtures('world_of')
 def test_a_tampered_world_continues_bit_for_bit(continue_in):
   single, batch = (tampered.World(h, _SAVED) for h in ('single', 'batch'))

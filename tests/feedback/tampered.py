@@ -6,7 +6,7 @@ that follows from it can be worked out by hand.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 import contextlib
-from typing import Any, Literal, NamedTuple, final
+from typing import Any, Literal, final
 
 import numpy as np
 
@@ -121,21 +121,6 @@ def design(
   }
 
 
-@final
-class Move(NamedTuple):
-  """A base block moves before a control step, so that readings grow.
-
-  Attributes:
-    step: Number of the control step, from 1.
-    name: Name of the register.
-    units: Increase of the readings.
-  """
-
-  step: int
-  name: str
-  units: float
-
-
 def move(env: Any, name: str, units: float, where: Any = None) -> None:
   """Moves the base block of a register, so that readings grow.
 
@@ -221,7 +206,7 @@ class World:
 
   def run(
       self,
-      moves: Sequence[Move],
+      moves: Sequence[tuple[int, str, float]],
       steps: int,
       *names: str,
       query: float = 0.0,
@@ -229,7 +214,7 @@ class World:
     """Returns what registers contain after each step of a new episode.
 
     Args:
-      moves: What moves in the episode.
+      moves: Step, register and units of each move, as for `step`.
       steps: Number of control steps.
       *names: Names of the registers.
       query: Query of the agent in every step.
@@ -241,7 +226,7 @@ class World:
     found = {name: ([], []) for name in names}
     self.begin()
     for step in range(1, steps + 1):
-      self.step([m[1:] for m in moves if m.step == step], query)
+      self.step([m[1:] for m in moves if m[0] == step], query)
       for name, sides in found.items():
         for side, value in zip(sides, self.contents(name), strict=True):
           side.append(value)
