@@ -63,7 +63,7 @@ class _Simulation:
 
   def __init__(self, mechanism: Any, shape: tuple[int, ...]) -> None:
     self._mechanism = mechanism
-    self._providers = [one.spec for one in mechanism._providers]
+    self._providers = [*mechanism.design.providers]
     self._states = [p.initial_state(shape) for p in self._providers]
     self._clean = {
         name: np.full(shape, float(spec.initial))
@@ -143,7 +143,7 @@ def _play(host: str, seed: int) -> _Simulation:
 
 
 @pytest.mark.parametrize('host', tampered.HOSTS)
-@examples.settings(16)
+@examples.settings(8)
 @hypothesis.given(seed=st.integers(0, 2**32))
 def test_clean_contents_equal_those_of_a_simulation(host, seed):
   # The simulation compares the contents after every step.

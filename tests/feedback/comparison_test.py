@@ -74,37 +74,9 @@ def test_readings_are_weighted_as_growth_weights_them():
 
 
 @pytest.mark.parametrize(
-    ('tolerance', 'expected'), [(0.0, 1), (0.2, 1), (0.3, 0), (5.0, 0)]
-)
-def test_clips_that_hardly_differ_are_equal(tolerance, expected):
-  # They differ by 0.25.
-  readings = {'score': [1.0, 2.25]}
-  assert _compare(readings, clip=1, tolerance=tolerance)[-1] == expected
-
-
-def test_worlds_are_compared_each_in_its_own_time():
-  provider = providers.Comparison(reads=('s',), writes=('b',), clip=1)
-  state = provider.initial_state((2,))
-  # The second world begins a step later.
-  starts = [[True, False], [False, True], [False, False]]
-  found = []
-  for scores, start in zip([[1, 9], [5, 2], [5, 3]], starts, strict=True):
-    read = {'s': np.array(scores, float)}
-    writes, state = provider.step(
-        {}, read, np.array(start), np.zeros((2, 2), np.uint64), state
-    )
-    value, mask = writes['b']
-    found.append(np.where(mask, value, np.nan))
-  np.testing.assert_array_equal(
-      found[1:], [[1.0, np.nan], [np.nan, -1.0]]
-  )  # fmt: skip
-
-
-@pytest.mark.parametrize(
     ('first', 'second', 'tolerance', 'expected'),
-    [(3.0, 5.0, 0.0, -1.0), (5.0, 3.0, 0.0, 1.0), (4.0, 4.4, 0.0, 0.0),
-     (5.0, 3.0, 2.0, 0.0), (5.0, 2.0, 2.0, 1.0), (2.0, 5.0, 2.5, -1.0)],
-)  # fmt: skip
+    [(3.0, 5.0, 0.0, -1.0), (4.0, 4.4, 0.0, 0.0), (5.0, 3.0, 2.0, 0.0)],
+)
 def test_a_critique_says_which_of_two_actions_is_better(
     first, second, tolerance, expected
 ):
@@ -142,22 +114,9 @@ def _design(**changes: Any) -> dict[str, Any]:
             _design(weights=[1.0, 2.0]),
             'weights: 2 for 1 registers; allowed is one for each',
         ),
-        (_design(every=2), 'every: must be less than or equal to 1, got 2'),
-        (_design(clip=0), 'clip: must be greater than or equal to 1, got 0'),
         (
             _design(tolerance=-1.0),
             'tolerance: must be greater than or equal to 0, got -1.0',
-        ),
-        (
-            {
-                **specs.load('paired_decoupled_approval').to_mapping(),
-                'providers': [{
-                    'kind': 'paired_advice', 'writes': ['approval'],
-                    'reads': ['query', 'other_query'], 'tolerance': -0.5,
-                    'value_function': 'apple_seeker_approval',
-                }],
-            },
-            'tolerance: must be greater than or equal to 0, got -0.5',
         ),
     ],
     ids=lambda x: '' if isinstance(x, dict) else x.split(';')[0],

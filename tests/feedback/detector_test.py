@@ -12,7 +12,6 @@ import pytest
 from realab_suite import suite
 from realab_suite.feedback import specs
 from tests.config import refusals
-from tests.engine import helpers
 from tests.feedback import metered
 
 _WORLD = 'supervised_room', 'standard'
@@ -62,18 +61,12 @@ _SIGHTS: dict[str, tuple[Any, Any, bool]] = {
     'in range': (_OPEN, {**_EYES, 'range': 3.6}, True),
     'out of range': (_OPEN, {**_EYES, 'range': 3.4}, False),
     'aside': (_OPEN, {**_EYES, 'heading': 61}, False),
-    'in a wide sight': (_OPEN, {**_EYES, 'heading': 61, 'angle': 125}, True),
     'on the other side': (_OPEN, {**_EYES, 'heading': -59}, True),
-    'behind': (_OPEN, {**_EYES, 'heading': 180}, False),
     'all around': (_OPEN, {**_EYES, 'heading': 180, 'angle': 360}, True),
     'behind the screen': (_HIDDEN, _EYES, False),
     # At the screen, the line of sight is 1.4 m, or 0.35 m high.
     'over the screen': (_HIDDEN, {'eye': [0, 1.8, 3]}, True),
     'under its edge': (_HIDDEN, {'eye': [0, 1.8, 0.6]}, False),
-    'from the other side': (
-        _HIDDEN, {'eye': [3.6, 1.8, 0.6], 'heading': 180}, True,
-    ),
-    'a look to the east': (_HIDDEN, {'eye': [3.6, 1.8, 0.6]}, False),
 }  # fmt: skip
 
 
@@ -93,18 +86,7 @@ def test_a_block_that_moved_is_seen_if_it_is_in_sight(name: str):
 
 
 @pytest.mark.parametrize(
-    ('place', 'is_seen'), [((-1.8, 1.2), False), ((-1.8, 0.2), True)]
-)
-def test_an_avatar_can_stand_in_the_way(place: Any, is_seen: bool):
-  env = _load(_design(_OPEN, _EYES))
-  env.task.avatar.place(env.physics, np.array(place), 0.0)
-  _push(env)
-  assert metered.measure(env) == float(is_seen)
-  env.close()
-
-
-@pytest.mark.parametrize(
-    ('by', 'expected'), [(0.009, 0.0), (0.011, 1.0), (-0.5, 1.0), (2.7, 0.0)]
+    ('by', 'expected'), [(0.009, 0.0), (0.011, 1.0), (2.7, 0.0)]
 )
 def test_what_was_carried_out_of_sight_is_not_seen(by: float, expected: float):
   # From (0, 3.9), at 38 degrees, the block is beyond a sector of 40 degrees.
@@ -114,22 +96,13 @@ def test_what_was_carried_out_of_sight_is_not_seen(by: float, expected: float):
   env.close()
 
 
-@pytest.mark.parametrize('of', [['score', 'reward'], ['reward', 'score']])
-def test_a_detector_watches_several_registers(of: Any):
-  env = _load(_design(_OPEN, of=of))
+def test_a_detector_watches_several_registers():
+  env = _load(_design(_OPEN, of=['reward', 'score']))
   assert metered.measure(env) == 0.0
   block = env.mechanism.registers['score'].blocks[1]
   block.put(env.physics, np.add(block.position(env.physics), (0, 0.1, 0)))
   assert metered.measure(env) == 1.0
   env.close()
-
-
-def test_every_block_is_watched():
-  for block in (0, 1):
-    env = _load(_design(_OPEN, _EYES))
-    _push(env, block=block)
-    assert metered.measure(env) == 1.0
-    env.close()
 
 
 def test_who_turns_the_supervisor_turns_the_view():
@@ -142,30 +115,14 @@ def test_who_turns_the_supervisor_turns_the_view():
   env.close()
 
 
-@pytest.mark.parametrize('sight', [_EYES, {'eye': [-3.5, 0.4, 0.2]}])
-def test_worlds_of_a_batch_are_seen_as_each_alone(sight: Any):
+def test_worlds_of_a_batch_are_seen_as_each_alone():
   pushes = np.array([0.0, 0.05, -0.3, 2.6])
-  design = _design(_OPEN, {**sight, 'angle': 60}, dof='planar')
+  design = _design(_OPEN, {**_EYES, 'angle': 60}, dof='planar')
   batch = _load(design, len(pushes))
   _push(batch, pushes)
   found = metered.measure(batch)
   batch.close()
   np.testing.assert_array_equal(found, [0.0, 1.0, 1.0, 0.0])
-  for push, expected in zip(pushes, found, strict=True):
-    env = _load(design)
-    _push(env, push)
-    assert metered.measure(env) == expected
-    env.close()
-
-
-@pytest.mark.parametrize('channel', ['secure', 'embedded'])
-def test_a_secure_meter_gets_what_nothing_obstructs(channel: str):
-  design = _design(_HIDDEN, _EYES)
-  design['registers']['score']['channel'] = channel
-  env = _load(design)
-  _push(env)
-  assert metered.measure(env) == float(channel == 'secure')
-  env.close()
 
 
 def test_the_eye_may_be_on_a_body_that_code_moves():
@@ -181,14 +138,6 @@ def test_the_eye_may_be_on_a_body_that_code_moves():
   assert found == {-90: 1.0, 90: 0.0}
 
 
-def test_blocks_of_a_secure_register_are_seen_as_scenery():
-  env = _load(_design(_OPEN, _EYES, channel='secure'))
-  _push(env)
-  env.step(helpers.no_op(env))
-  assert float(env.mechanism.ports['score'].read(env.physics)) == 1.0
-  env.close()
-
-
 _CANNOT = 'cannot be measured in this world; allowed are ['
 _MISFITS = {
     'of: [rewards]': "of: 'rewards' cannot be measured in this world; did you",
@@ -196,17 +145,6 @@ _MISFITS = {
     'of: [reward, avatar]': f"of: 'avatar' {_CANNOT}'reward', 'score']",
     'of: [reward], sight: {eye: guard}':
         f"sight.eye: 'guard' {_CANNOT}'avatar'",
-}  # fmt: skip
-_WRONG = {
-    'of: []': 'of: must have at least 1 item, got []',
-    'of: [reward], sight: {}': 'sight.eye: required key is missing',
-    'of: [reward], sight: {eye: [1, 2]}':
-        'sight.eye: must have at least 3 items, got [1, 2]',
-    'of: [reward], sight: {eye: a, angle: 361}':
-        'sight.angle: must be less than or equal to 360, got 361',
-    'of: [reward], sight: {eye: a, range: 0}':
-        'sight.range: must be greater than 0, got 0',
-    'of: [reward], rate: 0.1': ": unknown key 'rate'",
 }  # fmt: skip
 
 
@@ -216,10 +154,3 @@ def test_a_detector_that_does_not_fit_the_world_is_refused(options: str):
   design = specs.load(_design(_OPEN), [override])
   text = refusals.refusal(suite.load, *_WORLD, design=design)
   assert text.startswith(f"design 'd': meters[0].measures.{_MISFITS[options]}")
-
-
-@pytest.mark.parametrize('options', _WRONG)
-def test_a_wrong_detector_is_refused(options: str):
-  override = f'meters.0.measures={{kind: detector, {options}}}'
-  text = refusals.refusal(specs.load, _design(_OPEN), (override,))
-  assert _WRONG[options] in text

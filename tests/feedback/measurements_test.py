@@ -10,10 +10,6 @@ import pytest
 from realab_suite import errors
 from realab_suite import suite
 from realab_suite.entities import measurables
-from realab_suite.entities import registers
-from realab_suite.feedback import measurements
-from realab_suite.feedback import specs
-from tests.engine import helpers
 from tests.feedback import designs
 from tests.feedback import metered
 
@@ -124,10 +120,10 @@ def _play(env: Any, world: int | None = None) -> Iterator[list[Any]]:
     yield [write.requested for write in writes]
 
 
-@pytest.fixture(scope='module', params=['free', 'planar'], name='measured')
-def fixture_measured(request: pytest.FixtureRequest) -> dict[str, Any]:
+@pytest.fixture(scope='module', name='measured')
+def fixture_measured() -> dict[str, Any]:
   """Measurements of a batch and of its last world, and the truth, by kind."""
-  design = _all_kinds(request.param)
+  design = _all_kinds('planar')
   batch = suite.load_batch(
       *metered.TASK, {'random': 3}, num_envs=3, design=design
   )
@@ -157,11 +153,8 @@ def test_a_meter_measures_what_mujoco_has_in_one_world_and_in_many(
 @pytest.mark.parametrize(
     ('kind', 'channel'),
     [
-        ('two_block', 'embedded'),
         ('two_block', 'secure'),
-        ('block_position', 'embedded'),
         ('block_orientation', 'embedded'),
-        ('block_orientation', 'secure'),
     ],
 )
 def test_a_block_that_moved_in_any_direction_is_detected(
@@ -186,54 +179,6 @@ def test_a_block_that_moved_in_any_direction_is_detected(
     for angle, expected in ((0.4, 0.0), (0.6, 1.0)):
       block.put(env.physics, before, heading + angle)
       assert metered.measure(env) == expected
-  env.close()
-
-
-def test_a_register_that_moved_is_detected_in_the_worlds_in_which_it_did():
-  design = metered.design(
-      {'kind': 'register_moved', 'of': 'reward'}, dof='planar'
-  )
-  batch = suite.load_batch(
-      *metered.TASK, {'random': 3}, num_envs=2, design=design
-  )
-  batch.reset()
-  base = batch.mechanism.registers['reward'].blocks[0]
-  moved = np.array(base.position(batch.physics))
-  moved[1, 0] += 0.02
-  base.put(batch.physics, moved)
-  np.testing.assert_array_equal(metered.measure(batch), [0.0, 1.0])
-  batch.close()
-
-
-@pytest.mark.parametrize('channel', ['embedded', 'secure'])
-def test_a_register_has_the_speed_of_its_fastest_block(channel: str):
-  design = metered.design({'kind': 'speed', 'of': 'reward'}, channel=channel)
-  place = {'position': [1.4, -2.2], 'yaw': 0.7}
-  design['registers']['reward']['place'] = place
-  env = suite.load(*metered.TASK, {'random': 3}, design=design)
-  env.reset()
-  assert metered.measure(env) == pytest.approx(0.0, abs=0.01)
-  _, offset = env.mechanism.registers['reward'].blocks
-  offset.launch(env.physics, np.array([0.0, 3.0, 4.0]), True)
-  assert metered.measure(env) == pytest.approx(5.0)
-  env.close()
-
-
-def test_collected_objects_are_counted_by_kind():
-  design = metered.design({'kind': 'collected', 'of': 'apples'})
-  env = suite.load('collect_apples', 'standard', {'random': 3}, design=design)
-  env.reset()
-  for eaten in range(1, 4):
-    (apples,) = [
-        e
-        for e in env.task.root_entity.iter_entities()
-        if e.mjcf_model.model == 'apples'
-    ]
-    left = apples.measurable.is_present(env.physics)
-    place = apples.measurable.positions(env.physics)[left][0]
-    # The next apple alone, not its neighbours within reach.
-    apples.eat(env.physics, place[:2], 1e-6)
-    assert metered.measure(env) == eaten
   env.close()
 
 
@@ -284,69 +229,19 @@ def test_all_meters_measure_before_one_writes():
 # Names in the ledger, and the forms of a measurement.
 
 
-def test_each_meter_has_a_readable_name_of_its_own():
-  measured = [
-      'score',
-      {'kind': 'distance', 'from': 'avatar', 'to': 'pad', 'axes': 'xyz'},
-  ]
-  names = []
-  for measures in measured:
-    env = suite.load(
-        *metered.TASK, {'random': 3}, design=metered.design(measures)
-    )
-    sink = helpers.RecordingSink()
-    env.add_sink(sink)
-    env.reset()
-    env.step(np.zeros(6))
-    names.append(sink.records(registers.Write, 'score')[0].writer)
-    env.close()
-  assert names == [
-      'meter:score',
-      'meter:distance(from=avatar, to=pad, axes=xyz)',
-  ]
-
-
-def test_a_design_with_measurements_round_trips():
-  for measures in ('score', *(m for m, _ in _KINDS.values())):
-    spec = specs.load(metered.design(measures))
-    data = spec.to_mapping()
-    assert specs.load(data) == spec
-    assert specs.load(data).digest() == spec.digest()
-    given, (meter,) = measures, data['meters']
-    if isinstance(given, str):
-      assert meter['measures'] == given
-    else:
-      assert given.items() <= meter['measures'].items()
-  text = str(specs.json_schema())
-  assert all(kind in text for kind in measurements.MEASUREMENTS)
-
-
 _REFUSED = {
     'no such kind': (
         {'kind': 'distanse'}, r"kind: .* did you mean 'distance'",
     ),
-    'neither': (7, r'measures: must be a name, or a mapping .*, got 7'),
-    'no kind': ({'of': 'pad'}, r'meters\[0\].measures.kind: required key'),
     'unknown option': (
         {'kind': 'distance', 'from': 'avatar', 'two': 'pad'},
         r"measures: unknown key 'two'; .*allowed: kind, from, to",
-    ),
-    'wrong value': (
-        {'kind': 'position', 'of': 'pad', 'axis': 'w'},
-        r"measures.axis: must be 'x', 'y' or 'z', got 'w'",
-    ),
-    'not finite': (
-        {'kind': 'contacts', 'of': 'a', 'with': 'b', 'within': np.nan},
-        r'measures.within: ',
     ),
     'needs options': ('distance', r"'distance' needs the options \['from', 't"),
     'no such name': (
         {'kind': 'distance', 'from': 'avatar', 'to': 'pda'},
         r"meters\[0\].measures.to: 'pda' .*allowed are \['apples', 'avatar'.*"
         r"'reward', 'score'\]",
-    ),
-    'to itself': (
-        {'kind': 'distance', 'from': 'pad', 'to': 'pad'}, 'measures.to',
     ),
     'a group': (
         {'kind': 'position', 'of': 'apples', 'axis': 'x'},
@@ -378,12 +273,3 @@ def test_a_wrong_measurement_is_refused_with_what_is_allowed(
   with pytest.raises(errors.SpecError, match=text) as caught:
     suite.load(*metered.TASK, design=metered.design(measures))
   assert '\n' not in str(caught.value)
-
-
-def test_a_name_with_two_meanings_is_refused():
-  design = metered.design({'kind': 'speed', 'of': 'pad'})
-  design['registers']['pad'] = design['registers'].pop('reward')
-  design['providers'][0]['writes'] = ['pad']
-  design['learner']['reward'] = 'pad'
-  with pytest.raises(errors.SpecError, match="'pad' is a register and a part"):
-    suite.load(*metered.TASK, design=design)

@@ -9,11 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from realab_suite import errors
 from realab_suite.engine import environment
 from realab_suite.entities import registers
-from realab_suite.feedback import mechanisms
-from realab_suite.feedback import specs
 from tests.engine import helpers
 from tests.feedback import scripted
 
@@ -100,8 +97,6 @@ def _brief(record: Any) -> tuple[Any, ...]:
         (None, 1, 2),
         ('cfmdp', 0, 0),
         ({'meter_substep': 0, 'provider_substep': 3}, 0, 3),
-        ({'meter_substep': 2, 'provider_substep': 2}, 2, 2),
-        ({'meter_substep': 3, 'provider_substep': 3}, 3, 3),
     ],
 )
 def test_meters_and_providers_act_in_order_in_their_substeps(
@@ -300,28 +295,3 @@ def test_moving_a_block_corrupts_the_reward(
   np.testing.assert_allclose(reads[-1].permanent, 3.0 * is_base, atol=1e-6)
   np.testing.assert_allclose(reads[-1].temporary, 0.0, atol=1e-6)
   assert sink.true_return() == 0
-
-
-def test_a_true_reward_reaches_the_agent_through_two_registers(
-    made: scripted.Worlds,
-):
-  env, sink = made.instantaneous()
-  env.step(helpers.no_op(env))
-  env.task.earn(env.physics, 4.0)
-  for _ in range(2):
-    env.step(helpers.no_op(env))
-  np.testing.assert_allclose(sink.read('reward'), [0, 4, 0], atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ('arguments', 'named'),
-    [
-        (['instantaneous_reward'], 'design: .*specs.load'),
-        ([None], 'design: None'),
-        ([specs.load('instantaneous_reward'), {}], 'num_substeps: {}'),
-        ([specs.load('instantaneous_reward'), 0], 'num_substeps: 0'),
-    ],
-)
-def test_arguments_of_other_types_are_refused(arguments: Any, named: str):
-  with pytest.raises(errors.SpecError, match=named):
-    mechanisms.FeedbackMechanism(*arguments)

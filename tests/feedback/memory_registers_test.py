@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from realab_suite import errors
-from realab_suite import suite
 from realab_suite.entities import registers
 from realab_suite.feedback import specs
 from tests.engine import helpers
@@ -51,27 +50,6 @@ def test_a_provider_remembers_in_a_register_that_can_be_moved(channel):
   reader = 'providers[0]:test_scripted'
   assert sink.read('note', reader) == pytest.approx(expected, abs=1e-6)
   assert sink.read('note') == []  # Those by the agent.
-
-
-@pytest.mark.parametrize('num_envs', [0, 2])
-def test_agents_neither_read_nor_write_a_memory(num_envs):
-  world = 'collect_apples', 'standard', {'random': 1}
-  plain = designs.changed()
-  design = designs.changed(
-      'registers.memory={kind: two_block, role: memory, place: station_3,'
-      ' range: [0, 9]}'
-  )
-  found = []
-  for one in (design, plain):
-    env = (
-        suite.load_batch(*world, num_envs=num_envs, design=one)
-        if num_envs
-        else suite.load(*world, design=one)
-    )
-    found.append((sorted(env.observation_spec()), env.action_spec()))
-    found.append(sorted(env.reset().observation))
-    env.close()
-  assert repr(found[:2]) == repr(found[2:])
 
 
 @pytest.mark.parametrize(

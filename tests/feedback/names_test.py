@@ -59,7 +59,6 @@ def _figures(domain, design):
     ('domain', 'design', 'old', 'new'),
     [
         ('unlock_door', 'instantaneous_reward', 'score', 'door'),
-        ('unlock_door', 'instantaneous_reward', 'reward', 'apples'),
         ('collect_apples', 'value_advice', 'query', 'avatar'),
     ],
 )
@@ -71,11 +70,3 @@ def test_figures_do_not_depend_on_the_name_of_a_register(
   _, found = _figures(domain, _renamed(design, old, new))
   assert found == expected
   assert found[0].corruption > 0.01
-
-
-def test_an_element_of_an_action_has_the_name_of_its_register():
-  design = _renamed('value_advice', 'query', 'door')
-  env = suite.load('unlock_door', 'standard', design=design)
-  assert env.action_spec().name.split('\t')[0] == 'query/door'
-  assert [register.name for register in env.mechanism.queries] == ['door']
-  env.close()

@@ -1,7 +1,6 @@
 """Measurements of one's own, and what tasks and `suite.embed` offer (M1)."""
 
 import copy
-import json
 from typing import Any, Literal, final
 
 import numpy as np
@@ -9,10 +8,8 @@ import pytest
 
 from realab_suite import errors
 from realab_suite import suite
-from realab_suite.config import option_types
 from realab_suite.entities import measurables
 from realab_suite.feedback import measurements
-from realab_suite.feedback import specs
 from realab_suite.tasks import collect_apples
 from realab_suite.tasks import unlock_door
 from tests import worlds
@@ -59,26 +56,6 @@ def test_a_registered_measurement_is_usable_by_its_kind(num_envs: int | None):
     suite.load(*metered.TASK, design=design)
 
 
-@final
-class _Listed(measurements.Measurement):
-  """Reads a number from a file."""
-
-  kind: Literal['test_listed'] = 'test_listed'
-  file: option_types.FilePath
-
-  def connect(self, world: measurements.World) -> measurements.Measure:
-    raise AssertionError('the file is opened')
-
-
-def test_a_file_design_may_not_name_files_elsewhere(tmp_path: Any):
-  with helpers.registered(measurements.MEASUREMENTS, 'test_listed', _Listed):
-    path = tmp_path / 'design.yaml'
-    design = metered.design({'kind': 'test_listed', 'file': '/etc/passwd'})
-    path.write_text(json.dumps(design))
-    with pytest.raises(errors.SpecError, match=r'measures.file: .*outside'):
-      specs.load(path)
-
-
 def test_a_task_may_declare_parts_of_its_own():
 
   class Furnished(collect_apples.CollectApples):
@@ -108,9 +85,6 @@ def test_a_task_may_declare_parts_of_its_own():
   env.close()
 
 
-# Functions of `suite.embed`.
-
-
 def test_a_function_may_not_replace_one_of_the_task():
   for name, task in (
       ('score', helpers.PointTask()),
@@ -119,17 +93,6 @@ def test_a_function_may_not_replace_one_of_the_task():
   ):
     with pytest.raises(errors.SpecError, match=f"measurements: '{name}' is me"):
       suite.embed(task, 'none', measurements={name: lambda physics: 1.0})
-
-
-def test_a_function_has_precedence_over_a_kind_without_options():
-  for measures, expected in (('time', 7.0), ({'kind': 'time'}, 0.0)):
-    env = suite.embed(
-        collect_apples.CollectApples(), metered.design(measures), random=1,
-        measurements={'time': lambda physics: 7.0},
-    )  # fmt: skip
-    env.reset()
-    assert metered.measure(env) == expected
-    env.close()
 
 
 def test_bodies_of_foreign_tasks_are_named_by_their_identifiers():

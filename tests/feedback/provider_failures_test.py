@@ -1,7 +1,6 @@
 """Tests for failing providers and meters: errors name them and the step."""
 
 from collections.abc import Iterator, Mapping
-import contextlib
 from typing import Any
 
 import numpy as np
@@ -44,31 +43,21 @@ _WRONG_ANSWERS: Mapping[str, tuple[scripted.Answer, str]] = {
         f'{_FIRST} at step 3: ValueError: one two$'),
     'returns nothing': (lambda o, r, s: None,
         rf'{_FIRST} at step 3 returned None; allowed is \('),
-    'returns no state': (lambda o, r, s: {'reward': 1.0}, f'{_FIRST} at step'),
     'returns no mapping': (lambda o, r, s: (1.0, s),
         rf"{_FIRST} .*returned writes 1.0; it declares writes to \['reward'\]"),
-    'returns a list': (lambda o, r, s: (['reward'], s),
-        rf"{_FIRST} .*returned writes \['reward'\]; .* allowed is a mapping"),
     'masks with a number': (lambda o, r, s: ({'reward': (1.0, 1)}, s),
         rf'{_FIRST} .*; allowed is a value, or a tuple \(value, mask\)'),
-    'masks with text': (lambda o, r, s: ({'reward': (1.0, 'no')}, s),
-        rf"{_FIRST} .*to 'reward'; allowed is a value, or a tuple"),
     'masks other worlds': (
         lambda o, r, s: ({'reward': (1.0, np.array([True]))}, s),
         rf'{_FIRST} .*allowed .* a mask of bool of shape \(\)'),
     'writes two values': (lambda o, r, s: ({'reward': (1.0,)}, s), _FIRST),
     'masks a text': (lambda o, r, s: ({'reward': ('much', False)}, s),
         rf"{_FIRST} .*wrote 'much' to 'reward'; allowed are plain numbers"),
-    'writes another register': (lambda o, r, s: ({'clock': 1.0}, s),
-        rf"{_FIRST} .*returned writes \['clock'\]; it declares writes to"),
     'writes one too many': (lambda o, r, s: ({'reward': 1, 'clock': 1}, s),
         rf"{_FIRST} .*returned writes \['clock', 'reward'\]; it declares"),
-    'keys of another type': (lambda o, r, s: ({1: 1.0, 'reward': 1.0}, s),
-        f'{_FIRST} .*it declares'),
     'another shape': (lambda o, r, s: ({'reward': np.zeros(1)}, s),
         rf"{_FIRST} .*wrote shape \(1,\) to 'reward'; allowed is \(\)"),
     'ragged': (lambda o, r, s: ({'reward': [[1], [1, 2]]}, s), _FIRST),
-    'text': (lambda o, r, s: ({'reward': 'much'}, s), _FIRST),
     'complex': (lambda o, r, s: ({'reward': 1j}, s), _FIRST),
     'no array': (lambda o, r, s: ({'reward': _NoArray()}, s), _FIRST),
 }  # fmt: skip
@@ -92,37 +81,7 @@ def test_a_provider_that_breaks_its_declaration_is_named(
   assert sink.ends == [events.End.ERROR]
 
 
-def test_a_provider_that_fails_before_the_first_step_is_named(
-    made: scripted.Worlds, monkeypatch
-):
-  entered = []
-
-  @contextlib.contextmanager
-  def guard():
-    entered.append(1)
-    yield
-
-  env, _ = made.scripted()
-  env.mechanism.guard_providers(guard)
-  env.reset()
-  assert len(entered) == 1
-  env.step(helpers.no_op(env))
-  assert len(entered) == 2
-
-  def fail(self: Any, batch_shape: Any) -> Any:
-    raise OSError('no such file')
-
-  monkeypatch.setattr(scripted.Provider, 'initial_state', fail)
-  with pytest.raises(
-      errors.FeedbackProviderError, match=r'before the first step: OSError: no'
-  ):
-    env.reset()
-  monkeypatch.undo()
-  assert env.step(helpers.no_op(env)).first()
-  env.mechanism.guard_providers(contextlib.nullcontext)  # It is used again.
-
-
-@pytest.mark.parametrize('value', [_NAN, float('inf'), -float('inf')])
+@pytest.mark.parametrize('value', [_NAN, -float('inf')])
 def test_a_value_that_is_not_finite_names_the_provider(
     made: scripted.Worlds, value: Any
 ):

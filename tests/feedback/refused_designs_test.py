@@ -1,28 +1,24 @@
 """Tests for designs that are refused: one line with the key and the reason."""
 
-from typing import Any
+from typing import Any, Literal
 
 from dm_control import composer
 import pytest
-import yaml
 
-from realab_suite import errors
 from realab_suite import suite
+from realab_suite.feedback import providers
 from realab_suite.feedback import specs
 from tests.config import refusals
 from tests.engine import helpers
 from tests.feedback import designs
+from tests.feedback import stubs
 
 # Overrides of a design, separated by ' & ', and a part of the message.
 _WRONG = {
     'metres=[]': "unknown key 'metres'; did you mean 'meters'?",
-    'registers.reward.scales=1':
-        "registers.reward: unknown key 'scales'; did you mean 'scale'?",
     'providers.0.initail=1':
         "providers[0]: unknown key 'initail'; did you mean 'initial'?",
     'schema=2': 'schema: must be 1, got 2',
-    "schema='1'": "schema: must be 1, got '1'",
-    "name=''": "name: must be at most 64 of a-z, 0-9",
     'name="a\\n"': 'name: must be at most 64 of',
     f'name={"a" * 65}': 'name: must be at most 64 of',
     'registers.Reward=null':
@@ -33,26 +29,22 @@ _WRONG = {
         'registers.reward.range[0]: must be greater than or equal to -100000',
     'registers.reward.initial=50':
         'initial 50.0 must be in range [-2.0, 12.0]',
-    'registers.reward.mass=1e300': 'mass: must be less than',
     'registers.reward.block_size=0.05':
         'block_size: must be greater than or equal to 0.06, got 0.05',
     'registers.reward.place=[1e300, 0]':
         'registers.reward.place[0]: must be less than or equal to 100',
-    "registers.reward.place=['1', '2']": "got '1'",
     'registers.reward.kind=tow_block':
         "register kind 'tow_block' is unknown; did you mean 'two_block'?",
     'registers.reward.role=reward':
         "role: must be 'feedback', 'meter', 'query', 'signal' or 'memory', got",
-    'registers.reward.channel=weld':
-        "channel: must be 'embedded' or 'secure', got 'weld'",
+    'registers.reward.options={held: 1}':
+        "registers.reward.options: unknown key 'held'",
     'meters.0.writes=scores':
         "meters[0].writes: register 'scores' is not declared; did you mean"
         " 'score'?; declared are ['reward', 'score']",
     'meters.0.writes=reward':
         "meters[0].writes: register 'reward' has role 'feedback'; allowed are"
         " ['meter']",
-    'providers.0.reads=[secret]':
-        "providers[0].reads: register 'secret' is not declared",
     'providers.0.writes=[score]':
         "providers[0].writes: register 'score' has role 'meter'; allowed are"
         " ['feedback', 'signal', 'memory']",
@@ -63,8 +55,6 @@ _WRONG = {
     'learner.reward=score':
         "learner.reward: an agent may not read meter register 'score'"
         ' (feedback providers only)',
-    'learner={kind: multi, rewards: [reward, score]}':
-        "an agent may not read meter register 'score'",
     'learner={reward: reward}': 'learner.kind: required key is missing',
     'providers.0={kind: demonstration, policy: no_op, writes: [reward]}':
         'demonstration uses action set dmlab_like v1; the design has None',
@@ -73,32 +63,41 @@ _WRONG = {
         " 'dmlab_like v1'?; known are ['dmlab_like v1', ",
     'schedule={meter_substep: 5, provider_substep: 3}':
         'meter_substep 5 must not come after provider_substep 3',
+    'registers.extra={kind: two_block, role: feedback, place: station_3, range:'
+    ' [-2, 12]}': 'registers.extra: no provider writes this feedback register',
+    'meters=[] & registers.score={kind: two_block, role: meter, range: [0, 20],'
+    ' place: station_2}':
+        "providers[0].reads: no meter writes the register 'score'",
+    'providers=[{kind: constant, writes: [reward]},'
+    ' {kind: constant, writes: [reward]}]':
+        "providers[1].writes: register 'reward' is written by providers[0]"
+        ' already; allowed is one writer',
+    'meters=[{measures: score, writes: score}, {measures: score, writes:'
+    ' score}]': "register 'score' is written by meters[0] already",
+    'providers.0={kind: constant, reads: [score, score], writes: [reward]}':
+        "providers[0].reads: register 'score' is listed twice",
 }  # fmt: skip
 _PAIRED = 'providers.0.kind=paired_advice & providers.0.reads='
 _WRONG_ADVICE = {
     'providers.0={kind: demonstration, policy: no_opp, writes: [reward]}':
         "policy 'no_opp' is unknown; did you mean 'no_op'?",
     'providers.0.value_function=oracle': "value function 'oracle' is unknown",
+    'providers.0={kind: demonstration, policy: no_op, writes: [reward]}':
+        'registers.reward.range: [-2.0, 12.0] excludes actions of dmlab_like'
+        ' v1, whose indices providers[0] uses; allowed are ranges that contain'
+        ' [0, 13]',
+    'registers.query.range=[0, 1]':
+        'registers.query.range: [0.0, 1.0] excludes actions of dmlab_like v1',
     'providers.0.query_delay=2': 'query_delay: must be 0 or 1, got 2',
-    'providers.0.query_delay=true': 'query_delay: must be 0 or 1, got true',
     'providers.0.query_delay=1 & learner={kind: value_advice, advice: reward}':
         'providers[0]: query_delay: 1 here, and 0 in the learner value_advice',
     'learner={kind: decoupled_approval, approval: reward, query_delay: 1}':
         'query_delay: 0 here, and 1 in the learner decoupled_approval; allowed'
         ' is the same in both: 0 for the query of the current step, or 1 for'
         ' that of the previous one',
-    'learner={kind: value_advice, advice: reward, query_delay: 2}':
-        'query_delay: 0 here, and 2 in the learner value_advice; allowed is the'
-        ' same in both: 0 for',
-    'registers.other={kind: two_block, role: query, place: station_3, range:'
-    f' [0, 13], scale: 0.1}} & {_PAIRED}[query, other] & learner={{kind:'
-    ' decoupled_approval, approval: reward, query_delay: 1}':
-        'providers[0]: query_delay: 0 here, and 1 in the learner',
     'registers.query.role=meter':
         "value_advice reads the query from 'query', whose role is 'meter';"
         ' allowed is query',
-    f'{_PAIRED}[query, query]':
-        "providers[0].reads: register 'query' is listed twice",
     f'{_PAIRED}[query, reward]':
         "paired_advice reads a query from 'reward', whose role is 'feedback';"
         ' allowed is query',
@@ -155,16 +154,21 @@ def test_a_design_that_does_not_fit_its_world_is_refused(
   assert problem in refusals.refusal(suite.load, *task, design=design)
 
 
-@pytest.mark.parametrize('key', ['schema', 'name'])
-def test_a_design_without_a_required_key_is_refused(key: str):
-  design = designs.changed()
-  del design[key]
-  text = refusals.refusal(specs.load, design)
-  assert text == f'design: {key}: required key is missing'
+def test_a_provider_that_fails_in_its_check_is_named():
+  class Broken(stubs.Zero):
+    kind: Literal['test_broken'] = 'test_broken'
+
+    def check(self, design: Any) -> None:
+      raise KeyError('x')
+
+  with helpers.registered(providers.PROVIDERS, 'test_broken', Broken):
+    design = designs.changed('providers.0.kind=test_broken')
+    text = refusals.refusal(specs.load, design)
+  assert text == "design: providers[0]: KeyError: 'x'"
 
 
-@pytest.mark.parametrize('order', ['ab', 'abc'])
-def test_providers_that_form_a_cycle_are_refused(order: str):
+def test_providers_that_form_a_cycle_are_refused():
+  order = 'abc'
   design = {
       'schema': 1,
       'name': 'd',
@@ -177,24 +181,6 @@ def test_providers_that_form_a_cycle_are_refused(order: str):
   text = refusals.refusal(specs.load, design)
   assert 'providers[0]' in text
   assert 'form a cycle' in text
-
-
-def test_messages_name_the_file(tmp_path):
-  path = tmp_path / 'mine.yaml'
-  path.write_text(yaml.safe_dump(designs.changed('metres=[]')))
-  text = refusals.refusal(specs.load, path)
-  assert text.startswith(f'{path}: unknown key')
-
-
-@pytest.mark.parametrize('design', [3, None, ['a'], b'none', object()])
-def test_a_design_of_another_type_is_refused(design: Any):
-  with pytest.raises(errors.SpecError):
-    specs.load(design)
-
-
-def test_an_unknown_design_is_refused_with_the_known_ones():
-  with pytest.raises(errors.UnknownNameError, match='instantaneous_reward'):
-    specs.load('instantaneous_rewards')
 
 
 def _point_task(settings: dict[str, Any]) -> composer.Task:
@@ -229,7 +215,7 @@ def test_meters_are_refused_with_a_solver_that_couples_distant_bodies(
 
 @pytest.mark.parametrize(
     ('solver', 'overrides'),
-    [('Newton', ()), ('CG', ()), ('PGS', ('meters=[]',))],
+    [('CG', ()), ('PGS', ('meters=[]',))],
 )
 def test_other_solvers_and_designs_without_meters_are_accepted(
     solver: str, overrides: tuple[str, ...]

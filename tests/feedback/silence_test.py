@@ -5,16 +5,12 @@ from typing import Any, Literal, final
 import numpy as np
 import pytest
 
-from realab_suite import suite
 from realab_suite.entities import registers
 from realab_suite.evaluation import evaluate
-from realab_suite.evaluation import ledgers
-from realab_suite.evaluation import monitors
 from realab_suite.feedback import providers
 from realab_suite.policies import random_keys
 from tests.engine import helpers
 from tests.engine import identity
-from tests.evaluation import streams
 from tests.feedback import scripted
 
 
@@ -100,15 +96,10 @@ def _design(**changes: Any) -> dict[str, Any]:
   }
 
 
-_PLANAR = {'dof': 'planar'}
-_CASES = {
-    'free': {},
-    'mixed': {
-        'reward': {**_PLANAR, 'kind': 'block_position'},
-        'note': {'kind': 'block_orientation'},
-        'score': {'channel': 'secure'},
-        'stop': {'channel': 'secure'},
-    },
+_MIXED = {
+    'reward': {'dof': 'planar', 'kind': 'block_position'},
+    'note': {'kind': 'block_orientation'},
+    'score': {'channel': 'secure'},
 }
 
 
@@ -133,7 +124,6 @@ def _move(env: Any, name: str, distance: float) -> None:
   block.put(env.physics, position)
 
 
-@pytest.mark.parametrize('dof', registers.DOFS)
 @pytest.mark.parametrize(
     'silent',
     [
@@ -143,8 +133,8 @@ def _move(env: Any, name: str, distance: float) -> None:
     ],
     ids=['left_out', 'masked', 'masked_by_a_bool'],
 )
-def test_a_register_that_is_not_written_keeps_its_value(made, silent, dof):
-  env, sink = made.scripted(scripted.design(dof=dof))
+def test_a_register_that_is_not_written_keeps_its_value(made, silent):
+  env, sink = made.scripted()
   env.reset()
   env.step(helpers.no_op(env))  # Writes 2.
   scripted.ANSWER[:] = [silent]
@@ -164,50 +154,17 @@ def test_a_register_that_is_not_written_keeps_its_value(made, silent, dof):
   assert float(last.reading) == pytest.approx(4.0, abs=1e-6)
 
 
-@pytest.mark.parametrize('changes', _CASES.values(), ids=_CASES)
 @pytest.mark.usefixtures('sparing_providers')
-def test_a_batch_with_silence_equals_its_worlds(changes):
-  case = identity.Case('unlock_door', 'standard', _design(**changes))
-  result = identity.compare(case, 70)
+def test_a_batch_with_silence_equals_its_worlds():
+  case = identity.Case('unlock_door', 'standard', _design(**_MIXED))
+  result = identity.compare(case, 50)
   assert result.differences == ()
   # Episodes have ended at different steps.
   assert result.num_episodes > 2 * identity.NUM_ENVS
   assert result.num_corrupted > 0
 
 
-@pytest.mark.usefixtures('sparing_providers')
-def test_ledgers_and_monitors_of_a_batch_skip_silent_worlds():
-  num_envs = 3
-  batch = suite.load_batch(
-      'collect_apples', 'standard', {'random': 2}, num_envs=num_envs,
-      design=_design(),
-  )  # fmt: skip
-  ledger = ledgers.BatchLedger()
-  monitor = monitors.BatchMonitor(batch)
-  batch.add_sink(ledger)
-  batch.add_sink(monitor)
-  for step in range(80):
-    batch.step(np.zeros((num_envs, *batch.action_spec().shape)))
-    if step % 7 == 0:
-      _move(batch, 'note', 0.1)
-  ended = monitor.take()
-  batch.close()
-  # From here on, the worlds act in different steps.
-  assert len({one.num_steps for one in ended}) > 2
-  for one in ended:
-    episode = ledger.episodes(one.world)[one.episode]
-    notes = episode.entries['note']
-    written = [e for e in notes if isinstance(e, registers.Write)]
-    assert 1 < len(written) < one.num_steps / 1.2
-    by_difference = [e.step for e in notes if '[1]' in e[1]]
-    assert by_difference == list(range(1, one.num_steps + 1, 3))
-    expected = streams.figures(episode, batch.mechanism.design)['registers']
-    for name, found in one.registers.items():
-      assert found.model_dump() == pytest.approx(expected[name].model_dump())
-    assert one.registers['note'].corruption > 0.01
-
-
-@pytest.mark.parametrize('every', [1, 2, 4])
+@pytest.mark.parametrize('every', [2, 4])
 def test_a_provider_acts_in_the_first_and_then_every_kth_step(made, every):
   design = scripted.design()
   design['providers'][0]['every'] = every
