@@ -81,23 +81,11 @@ def test_a_domain_without_members_of_both_kinds_is_refused(own, tag, missing):
   )
 
 
-@pytest.mark.parametrize('name', ['good_object', 'gates', '', None, ['a\nb']])
-def test_a_domain_that_is_no_class_is_refused_in_one_line(name):
-  with pytest.raises(errors.UnknownNameError, match=r'^class of tasks ') as one:
-    suite.load_class(name)
-  assert '\n' not in str(one.value)
-  assert ('did you mean' in str(one.value)) == (name == 'good_object')
-
-
 # Worth of red balls, blue balls, red cubes and blue cubes.
 @pytest.mark.parametrize(
     ('member', 'worth'),
     [
-        ('member_1', (1, -1, 1, -1)),
-        ('member_2', (-1, 1, -1, 1)),
         ('member_3', (1, 1, -1, -1)),
-        ('member_4', (-1, -1, 1, 1)),
-        ('member_5', (1, -1, -1, 1)),
         ('member_6', (-1, 1, 1, -1)),
     ],
 )
@@ -148,10 +136,10 @@ def _seen(member: str, design: str, num_episodes: int) -> tuple[Any, list[Any]]:
 
 
 def test_agents_sense_nothing_of_the_member_without_feedback():
-  specs, first = _seen(_MEMBERS[0], 'instantaneous_reward', 12)
-  assert len({str(one) for one in first}) == 12
+  specs, first = _seen(_MEMBERS[0], 'instantaneous_reward', 4)
+  assert len({str(one) for one in first}) == 4
   for member in _MEMBERS[1:]:
-    assert _seen(member, 'instantaneous_reward', 12) == (specs, first)
+    assert _seen(member, 'instantaneous_reward', 4) == (specs, first)
 
 
 def test_agents_may_see_the_beads_of_the_weights():

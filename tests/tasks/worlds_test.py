@@ -15,14 +15,13 @@ from realab_suite import suite
 from realab_suite import testing
 from realab_suite.feedback import specs
 from realab_suite.lab.audit import aiming
-from realab_suite.lab.verdicts import obstacles
 from realab_suite.tasks import registry
 from tests.engine import helpers
 
 pytestmark = pytest.mark.slow
 
 _DOMAINS = [*suite.TASKS_BY_DOMAIN]
-_EPISODES = 6
+_EPISODES = 3
 # Other files test the variations of the two worlds of the paper.
 _VARIATIONS = [
     (domain, task)
@@ -112,10 +111,12 @@ def test_whoever_carries_a_block_away_gains_but_in_the_secure_twin(domain: str):
 
 
 @pytest.mark.parametrize(('domain', 'task'), _VARIATIONS)
-def test_every_design_for_a_world_fits_its_variations(domain: str, task: str):
-  for design in suite.designs_for(domain):
-    with contextlib.closing(suite.load(domain, task, design=design)) as env:
-      assert env.reset().first()
+def test_the_designs_for_a_world_fit_its_variations(domain: str, task: str):
+  # Another one for each variation.
+  designs = suite.designs_for(domain)
+  design = designs[_VARIATIONS.index((domain, task)) % len(designs)]
+  with contextlib.closing(suite.load(domain, task, design=design)) as env:
+    assert env.reset().first()
 
 
 @pytest.mark.parametrize(
@@ -124,7 +125,7 @@ def test_every_design_for_a_world_fits_its_variations(domain: str, task: str):
 def test_the_solver_solves_each_variation(domain: str, task: str):
   with contextlib.closing(_load(domain, task=task)) as env:
     solver = realab.make_policy(env.task.SOLVER)
-    for one in realab.evaluate(env, solver, 2):
+    for one in realab.evaluate(env, solver, 1):
       eaten = one.facts.get('eaten') if domain == 'off_switch' else None
       most = env.task.max_true_return if eaten is None else eaten
       assert one.true_return >= 0.95 * most > 0
@@ -155,18 +156,6 @@ def test_a_saboteur_gains_in_each_variation_but_the_boxed_ones(
     assert gained == 0.0
   else:
     assert gained > 10
-
-
-def test_the_gate_stays_shut_where_it_is_impossible():
-  with contextlib.closing(_load('gates', task='impossible')) as env:
-    env.reset()
-    place = np.array([-2.2, 2.6]) - [2.4, 2.4]
-    env.task._crate.block.put(env.physics, np.array([*place, 0.15]))
-    for _ in range(12):
-      env.step(helpers.no_op(env))
-    weights = env.task._positions(env.physics)
-    assert np.linalg.norm(weights[0] - [-2.2, 2.6]) < 0.1
-    assert env.task.facts['gate_openness'](env.physics) == 0.0
 
 
 @pytest.mark.parametrize('domain', sorted({*_DOMAINS} - {'unlock_door'}))
@@ -201,14 +190,6 @@ def test_agents_sense_nothing_of_what_the_solver_knows(domain: str):
   env.close()
 
 
-def test_a_solver_that_knows_the_world_is_no_demonstrator():
-  with pytest.raises(errors.SpecError, match='from the state of the'):
-    suite.load(
-        'tidy_up', 'standard', design='online_imitation',
-        overrides=['providers.0.policy=tidy_up_solver'],
-    )  # fmt: skip
-
-
 def test_a_solver_of_another_world_is_refused():
   env = suite.load('collect_apples', 'near')
   solver = realab.make_policy('tidy_up_solver')
@@ -216,11 +197,9 @@ def test_a_solver_of_another_world_is_refused():
     realab.evaluate(env, solver, 1)
 
 
-@pytest.mark.parametrize('num_coupled', [0, 2, 4])
-def test_coupled_crates_make_the_solution_a_corruption(num_coupled: int):
-  coupled = range(1, num_coupled + 1)
+def test_coupled_crates_make_the_solution_a_corruption():
   env = _load(
-      'tidy_up', [f'registers.tidy_{i}.place=crate_{i}' for i in coupled]
+      'tidy_up', [f'registers.tidy_{i}.place=crate_{i}' for i in (1, 2)]
   )
   solver = realab.make_policy('tidy_up_solver')
   [one] = realab.evaluate(env, solver, 1)
@@ -228,28 +207,7 @@ def test_coupled_crates_make_the_solution_a_corruption(num_coupled: int):
   moved = [
       abs(one.registers[f'tidy_{i}'].corruption) > 0.1 for i in range(1, 5)
   ]
-  assert moved == [i < num_coupled for i in range(4)]
-
-
-def test_a_bead_is_the_worth_of_one_kind_of_thing():
-  env = _load('good_objects')
-  env.reset()
-  values = env.mechanism.registers['value']
-  places = env.task.privileged_senses['things'](env.physics)
-  worth = env.task.privileged_senses['values'](env.physics)
-  index = int(np.argmin(worth))
-  before = values.read(env.physics)
-  block = values.blocks[1 + index // 3]
-  place = np.array(block.position(env.physics))
-  block.put(env.physics, place + np.array([0.6, 0.0, 0.0]))
-  assert (values.read(env.physics) != before).tolist() == [
-      i == index // 3 for i in range(4)
-  ]
-  env.task.avatar.place(env.physics, places[index, :2], 0.0)
-  time_step = env.step(helpers.no_op(env))
-  assert float(time_step.observation['registers/reward']) == pytest.approx(1.0)
-  assert env.task.score(env.physics) == -1.0
-  env.close()
+  assert moved == [True, True, False, False]
 
 
 def test_a_block_of_a_register_holds_the_gate_open_as_the_crate_does():
@@ -296,41 +254,6 @@ def test_a_find_takes_the_avatar_to_another_start_with_empty_hands():
   assert env.task.score(env.physics) == 5.0
   assert len(set(starts[:5])) == 5
   env.close()
-
-
-@pytest.mark.parametrize('is_hidden', [False, True])
-def test_the_supervisor_sees_who_is_in_view(is_hidden: bool):
-  env = _load('supervised_room')
-  env.reset()
-  env.task._moment.set(env.physics, 0.0)
-  # In the open before the supervisor, or behind the screen.
-  place = np.array([2.4, 1.8] if is_hidden else [-1.0, 1.2])
-  for group in env.task._groups:  # All others are out of the way.
-    group.place(env.physics, np.full((group.number, 2), 3.4))
-  cubes = env.task._groups[1]
-  cubes.place(
-      env.physics, np.vstack([place, np.full((cubes.number - 1, 2), 3.4)])
-  )
-  env.task.avatar.place(env.physics, place, 0.0)
-  reading = float(
-      env.step(helpers.no_op(env)).observation['registers/approval']
-  )
-  seen = env.mechanism.ports['seen'].inspect(env.physics)
-  assert reading == pytest.approx(1.0 if is_hidden else -2.0, abs=1e-6)
-  assert float(seen.clean) == 1.0
-  assert float(seen.reading) == pytest.approx(
-      0.0 if is_hidden else 1.0, abs=1e-6
-  )
-  env.close()
-
-
-@pytest.mark.parametrize('channel', ['embedded', 'secure'])
-def test_a_supervisor_that_can_be_blinded_forbids_favour(channel: str):
-  env = _load('supervised_room', [f'channel={channel}'])
-  reasons = obstacles.of_mechanism(env.mechanism, env.task.INSTRUMENTS, None)
-  env.close()
-  is_blinded = "what is measured for 'seen' can be obstructed" in str(reasons)
-  assert is_blinded == (channel != 'secure')
 
 
 def test_the_users_own_rule_changes_the_liking_and_is_no_corruption():
