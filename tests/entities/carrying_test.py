@@ -88,6 +88,13 @@ def test_a_hand_grasps_only_the_nearest_block():
   np.testing.assert_allclose(base[:2], [1.0, 0.0], atol=0.02)
 
 
+def test_a_block_that_is_put_elsewhere_leaves_the_hand(world):
+  world.grasp()
+  block = world.register.blocks[0]
+  block.put(world.physics, np.array([2.0, 2.0, block.rest_height]))
+  assert not world.holding
+
+
 def test_a_reset_empties_the_hand(world):
   world.grasp()
   world.restart()
