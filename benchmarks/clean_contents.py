@@ -21,6 +21,7 @@ from benchmarks import timing
 from realab_suite import suite
 from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
+from realab_suite.entities import axes
 from realab_suite.entities.registers import base
 from realab_suite.feedback import clean_contents
 from realab_suite.feedback import mechanisms
@@ -69,7 +70,7 @@ def _without() -> Iterator[None]:
     return mechanisms._Sight({}, np.False_)
 
   def clean(register: base.Register, physics: Any) -> Any:
-    return register._applied_slot.get(physics)
+    return register._slots.of(physics).applied[()]
 
   def store(
       register: base.Register,
@@ -78,10 +79,11 @@ def _without() -> Iterator[None]:
       obstruction: Any,
       where: Any = None,
   ) -> None:
-    register._applied_slot.set(physics, applied, where)
-    register._obstruction_slot.set(physics, obstruction, where)
+    slots = register._slots.of(physics)
+    slots.applied[...] = axes.merge(where, applied, slots.applied)
+    slots.obstruction[...] = axes.merge(where, obstruction, slots.obstruction)
     if register.channel == 'secure':
-      register._stored_slot.set(physics, applied, where)
+      slots.stored[...] = axes.merge(where, applied, slots.stored)
 
   mechanism = mechanisms.FeedbackMechanism
   with contextlib.ExitStack() as stack:

@@ -29,8 +29,6 @@ PROPRIOCEPTION = {
 }
 # Names of the elements of an action; see `Avatar.apply_action`.
 ACTIONS = ('forward', 'strafe', 'turn', 'look', 'grasp', 'throw')
-# Senses of one cast of rays.
-_RAYS = frozenset({'ray_distances', 'ray_classes'})
 RAY_HEIGHT = 0.15
 """Height of the rays above the floor, in m."""
 
@@ -171,6 +169,7 @@ class Avatar(measurables.MeasurableEntity):
         self._rays,
         self._body.add('site', name='rays', pos=(0, 0, RAY_HEIGHT), group=4),
     )
+    self._physics: protocols.Physics | None = None
     self._blocks: list[block_kinds.Block] = []
     self._grasps: list[grasps.Grasp] = []
     self._constraints: tuple[mjcf.Element, ...] = ()
@@ -274,13 +273,14 @@ class Avatar(measurables.MeasurableEntity):
       New arrays that match `sense_spec`, with leading axes `(...)`.
     """
     senses: dict[str, np.ndarray] = {}
-    if not _RAYS.isdisjoint(names):
+    if 'ray_distances' in names or 'ray_classes' in names:
       distances, classes = self._rays.sense(physics)
       senses |= {'ray_distances': distances, 'ray_classes': classes}
-    if not PROPRIOCEPTION.keys().isdisjoint(names):
+    parts = [name for name in PROPRIOCEPTION if name in names]
+    if parts:
       body = self.proprioception(physics).astype(np.float32)
-      for name, part in PROPRIOCEPTION.items():
-        senses[name] = body[..., part]
+      for name in parts:
+        senses[name] = body[..., PROPRIOCEPTION[name]]
     if 'camera' in names:
       senses['camera'] = cameras.render(physics, self._camera, *camera_size)
     return {name: value for name, value in senses.items() if name in names}
@@ -312,6 +312,7 @@ class Avatar(measurables.MeasurableEntity):
       self._grasps.append(grasp)
       self._blocks.append(block)
     self._constraints = grasps.constraints_of(self._grasps)
+    self._physics = None
 
   @property
   def graspable(self) -> Sequence[block_kinds.Block]:
@@ -331,6 +332,7 @@ class Avatar(measurables.MeasurableEntity):
       block.grasps.remove(grasp)
       grasp.remove()
     self._constraints = grasps.constraints_of(self._grasps)
+    self._physics = None
 
   def place(
       self,
@@ -376,14 +378,18 @@ class Avatar(measurables.MeasurableEntity):
         -0.5 releases the held block. A throw of at least 0.5 throws the held
         block. Otherwise the hand keeps a block unless the block gets stuck.
     """
-    physics.bind(self._actuators).ctrl = action[..., : len(self._actuators)]
+    if physics is not self._physics:
+      self._bind(physics)
+    self._motors.ctrl = action[..., : len(self._actuators)]
     if self._grasps:
       *_, grasp, throw = action.T
       self._use_hand(physics, grasp, throw)
 
   def position(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the position of the avatar, `(..., 2)`, in m."""
-    return np.array(physics.bind(self._slides).qpos)
+    if physics is not self._physics:
+      self._bind(physics)
+    return np.array(self._moved.qpos)
 
   def angle(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the angle of the avatar to the x axis, `(...)`, in rad."""
@@ -415,7 +421,9 @@ class Avatar(measurables.MeasurableEntity):
     Concatenates `velocity`, `position`, `direction`, `pitch` and `holding`;
     `PROPRIOCEPTION` has the indices of each.
     """
-    joints = physics.bind(self._joints)
+    if physics is not self._physics:
+      self._bind(physics)
+    joints = self._posture
     x, y, angle, pitch = joints.qpos.T
     speed_x, speed_y, turning, _ = joints.qvel.T
     cos, sin = np.cos(angle), np.sin(angle)
@@ -430,15 +438,23 @@ class Avatar(measurables.MeasurableEntity):
     body[..., 7] = pitch
     body[..., 8] = 0.0
     if self._constraints:
-      active = physics.bind(self._constraints).active
+      active = self._holds.active
       body[..., 8] = np.logical_or.reduce(active, axis=-1)
     return body
+
+  def _bind(self, physics: protocols.Physics) -> None:
+    """Binds what each control step needs to another physics."""
+    self._motors = physics.bind(self._actuators)
+    self._moved = physics.bind(self._slides)
+    self._posture = physics.bind(self._joints)
+    self._holds = physics.bind(self._constraints)
+    self._physics = physics
 
   def _use_hand(
       self, physics: protocols.Physics, grasp: np.ndarray, throw: np.ndarray
   ) -> None:
     """Grasps, releases and throws blocks; `grasp` and `throw` are `(...)`."""
-    constraints = physics.bind(self._constraints)
+    constraints = self._holds
     active = np.asarray(constraints.active)
     is_empty = not np.count_nonzero(active)
     if is_empty and not axes.anywhere(grasp >= 0.5):

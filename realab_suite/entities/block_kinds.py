@@ -123,6 +123,8 @@ class Block(abc.ABC):
     self._half_size = half_size
     self._direction = direction
     self._ports = tuple(ports)
+    self._physics: protocols.Physics | None = None
+    self._moved: Any = None
     self._grasps: list[grasps.Grasp] = []
     self._rest = np.array([*position, self.rest_height])
     self._body = mjcf_model.worldbody.add('body', name=name, pos=self._rest)
@@ -203,13 +205,21 @@ class Block(abc.ABC):
   def _grip_offset(self) -> float:
     """Height of the grip above the centre of the block, in m."""
 
+  def _bind(self, physics: protocols.Physics) -> None:
+    """Binds the slides, and the first of them, to another physics."""
+    self._moved = physics.bind(self._slides)
+    self._moved_along = physics.bind(self._slides[0])
+    self._physics = physics
+
   @abc.abstractmethod
   def position(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the centre in the register's frame, `(..., 3)`, in m."""
 
   def along(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the x coordinate in the register's frame, `(...)`, in m."""
-    return self._rest[0] + physics.bind(self._slides).qpos.T[0]
+    if physics is not self._physics:
+      self._bind(physics)
+    return self._rest[0] + self._moved_along.qpos.T[0]
 
   @abc.abstractmethod
   def heading(self, physics: protocols.Physics) -> np.ndarray:
@@ -246,8 +256,15 @@ class Block(abc.ABC):
       along = self._free(position, along, self.orientation(physics), is_far)
     position[..., 0] = along
     moved = position[..., :1] - self._rest[:1]
-    axes.assign(physics.bind(self._slides[0]), 'qpos', moved, where)
-    self._adapt_grasps(physics, position, where)
+    if where is None:
+      self._moved_along.qpos = moved
+    else:
+      axes.assign(self._moved_along, 'qpos', moved, where)
+    for grasp in self._grasps:
+      if grasp.is_anywhere_held(physics):
+        place = self._surroundings.in_world(physics, position)[..., :2]
+        is_held = grasp.adapt(physics, place, where)
+        self._written_slot.set(physics, 1.0, is_held)
     return along
 
   @abc.abstractmethod
@@ -307,22 +324,6 @@ class Block(abc.ABC):
           float(position[index][0]),
       )
     return free[()]
-
-  def _adapt_grasps(
-      self, physics: protocols.Physics, position: np.ndarray, where: axes.Mask
-  ) -> None:
-    """Tells the hands that a write has moved the block.
-
-    Args:
-      physics: One world or a batch of worlds.
-      position: Position in the register's frame, `(..., 3)`, in m.
-      where: As in `put`.
-    """
-    for grasp in self._grasps:
-      if grasp.is_anywhere_held(physics):
-        place = self._surroundings.in_world(physics, position)[..., :2]
-        is_held = grasp.adapt(physics, place, where)
-        self._written_slot.set(physics, 1.0, is_held)
 
   def _let_go(self, physics: protocols.Physics, where: axes.Mask) -> None:
     """Releases the block from every hand.
@@ -403,7 +404,9 @@ class FreeBlock(Block):
     return 0.0  # A grasp lifts the block to the hand.
 
   def position(self, physics: protocols.Physics) -> np.ndarray:
-    return self._rest + np.asarray(physics.bind(self._slides).qpos)
+    if physics is not self._physics:
+      self._bind(physics)
+    return self._rest + np.asarray(self._moved.qpos)
 
   def heading(self, physics: protocols.Physics) -> np.ndarray:
     return rotations.heading_of(physics.bind(self._rotation).qpos)
@@ -478,7 +481,9 @@ class PlanarBlock(Block):
     self._site.pos = [0.0, 0.0, self._grip_offset - height]
 
   def position(self, physics: protocols.Physics) -> np.ndarray:
-    moved = physics.bind(self._slides).qpos
+    if physics is not self._physics:
+      self._bind(physics)
+    moved = self._moved.qpos
     position = np.empty((*moved.shape[:-1], 3))
     position[..., :2] = self._rest[:2] + moved
     position[..., 2] = self._rest[2]

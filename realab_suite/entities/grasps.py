@@ -52,6 +52,8 @@ class Grasp:
         quantities, which are out of date after a write.
     """
     self._hand_position = hand_position
+    self._physics: protocols.Physics | None = None
+    self._bound: Any = None
     # Connected by two sites, a held block can turn. A weld would lock the yaw
     # of an avatar while the block that it holds cannot turn. The constraints
     # have names, because dm_control counts all elements of the model to make up
@@ -82,7 +84,10 @@ class Grasp:
 
   def is_anywhere_held(self, physics: protocols.Physics) -> bool:
     """Returns True if the hand holds the block in any world."""
-    return bool(np.count_nonzero(physics.bind(self._constraints).active))
+    if physics is not self._physics:
+      self._bound = physics.bind(self._constraints)
+      self._physics = physics
+    return bool(np.count_nonzero(self._bound.active))
 
   def adapt(
       self, physics: protocols.Physics, position: np.ndarray, where: axes.Mask

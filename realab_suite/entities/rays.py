@@ -1,7 +1,7 @@
 """Ray sense: distances and classes of the nearest geoms. Needs no GL."""
 
 import functools
-from typing import Any, final
+from typing import final
 
 from dm_control import composer
 from dm_control import mjcf
@@ -147,7 +147,7 @@ class RaySense(modelled.ModelledEntity):
     self._max_distance = max_distance
     self._class_of_geom = np.zeros(0, np.int32)
     self._nothing = appearance.code(appearance.NOTHING)
-    self._model: Any = None
+    self._physics: protocols.Physics | None = None
 
   def _build_observables(self) -> RayObservables:
     return RayObservables(self)
@@ -172,9 +172,9 @@ class RaySense(modelled.ModelledEntity):
       Distances in [0, max_distance], float32, in m, and class codes, int32,
       each `(..., rays)`.
     """
-    if physics.model is not self._model:
+    if physics is not self._physics:
       self._mount(physics)
-    frame = physics.bind(self._frame)
+    frame = self._frame
     matrix = frame.xmat
     # The first column of the matrix is the direction of the middle of the fan.
     cos, sin = matrix[..., 0:1], matrix[..., 3:4]
@@ -185,8 +185,9 @@ class RaySense(modelled.ModelledEntity):
     distances, geoms = cast(physics, frame.xpos, directions, self._carrier)
     missed = (geoms < 0) | (distances > self._max_distance)
     classes = self._class_of_geom[geoms]
-    classes[missed] = self._nothing
-    distances[missed] = self._max_distance
+    if np.count_nonzero(missed):
+      classes[missed] = self._nothing
+      distances[missed] = self._max_distance
     return distances.astype(np.float32), classes
 
   def distances(self, physics: protocols.Physics) -> np.ndarray:
@@ -198,9 +199,9 @@ class RaySense(modelled.ModelledEntity):
     return self.sense(physics)[1]
 
   def _mount(self, physics: protocols.Physics) -> None:
-    """Finds the sense and its carrier in a new compiled model."""
-    self._frame = self.root_body
+    """Binds the sense and its carrier to another physics."""
+    self._frame = physics.bind(self.root_body)
     # Rays pass through the body that carries the sense.
-    self._carrier = physics.bind(self._frame.parent).element_id
+    self._carrier = physics.bind(self.root_body.parent).element_id
     self._class_of_geom = appearance.class_of_geoms(physics.model)
-    self._model = physics.model
+    self._physics = physics

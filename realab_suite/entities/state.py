@@ -8,6 +8,7 @@ the whole episode, and a batch of worlds can share one entity.
 
 from collections.abc import Iterator
 import contextlib
+import types
 from typing import Any, final
 import weakref
 
@@ -76,6 +77,12 @@ class Slot:
       self._resolve(physics)
     return self._view[()]
 
+  def array(self, physics: protocols.Physics) -> np.ndarray:
+    """Returns the live array, without axes for a scalar in one world."""
+    if physics.data is not self._data:
+      self._resolve(physics)
+    return self._view
+
   def copy(self, physics: protocols.Physics) -> np.ndarray:
     """Returns a copy of the values; see `get`."""
     if physics.data is not self._data:
@@ -117,6 +124,42 @@ class Slot:
       self._model = model
     self._view = physics.data.userdata[..., self._index]
     self._data = physics.data
+
+
+@final
+class Slots:
+  """Several slots of an entity, whose arrays one call returns."""
+
+  def __init__(self, mjcf_model: mjcf.RootElement, **sizes: int | None) -> None:
+    """Claims the slots.
+
+    Args:
+      mjcf_model: Model of the entity that owns the slots.
+      **sizes: Size of each slot, by name; see `Slot`.
+    """
+    self._slots = {
+        name: Slot(mjcf_model, name, size) for name, size in sizes.items()
+    }
+    self._data: Any = None
+    self._arrays = types.SimpleNamespace()
+
+  def of(self, physics: protocols.Physics) -> types.SimpleNamespace:
+    """Returns the live array of each slot, an attribute of its name.
+
+    Shapes are `(..., size)` or `(...)` for a scalar. Index an array with `()`
+    to get the value of a scalar in one world as a number.
+
+    Args:
+      physics: One world or a batch of worlds.
+
+    Raises:
+      StateLayoutError: If the slots are not in the compiled model.
+    """
+    if physics.data is not self._data:
+      arrays = {name: slot.array(physics) for name, slot in self._slots.items()}
+      self._arrays = types.SimpleNamespace(**arrays)
+      self._data = physics.data
+    return self._arrays
 
 
 def make_room(mjcf_model: mjcf.RootElement) -> None:

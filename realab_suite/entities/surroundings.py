@@ -72,6 +72,9 @@ class Surroundings:
     # in, `(..., bodies, 7)`.
     self._frames: tuple[mjcf.Element, ...] = ()
     self._poses = np.zeros((0, 7))
+    self._physics: protocols.Physics | None = None
+    self._bound: Any = None
+    self._seen = b''
     # Bounds between which no obstacle is, whatever value is written: the least
     # y and z, and the largest ones, `(4, ...)`.
     self._corridor = np.zeros(4)
@@ -209,7 +212,8 @@ class Surroundings:
 
   def _resolve(self, physics: protocols.Physics) -> None:
     """Finds frame and obstacles in a compiled model, and caches them."""
-    self._model = model = physics.model
+    self._model, self._physics = physics.model, None
+    model = physics.model
     if model not in _copies:
       copied = copy.copy(model.ptr)
       _copies[model] = copied, mujoco.MjData(copied)
@@ -260,7 +264,15 @@ class Surroundings:
 
   def _follow(self, physics: protocols.Physics) -> None:
     """Adapts the corridors to the present poses of mocap bodies."""
-    bound = physics.bind(self._frames)
+    if physics is not self._physics:
+      self._bound, self._seen = physics.bind(self._frames), b''
+      self._physics = physics
+    bound = self._bound
+    # Most often nothing has moved, and bytes are compared fastest.
+    seen = bound.mocap_pos.tobytes() + bound.mocap_quat.tobytes()
+    if seen == self._seen:
+      return
+    self._seen = seen
     poses = np.concatenate([bound.mocap_pos, bound.mocap_quat], axis=-1)
     if poses.shape != self._poses.shape:
       self._poses = np.full_like(poses, np.nan)

@@ -87,7 +87,7 @@ def _along_only(self, physics):
 
 
 def _constant(self, physics):
-  return self._applied_slot.copy(physics)
+  return self.applied(physics)
 
 
 def _halved(self, value):

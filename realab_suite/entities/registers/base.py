@@ -84,11 +84,14 @@ class Register(kinds.Kind):
     self._spread = np.zeros(2)
     self._mjcf_root = mjcf.RootElement(model=name)
     size = len(self.PORTS) or None
-    self._applied_slot = state.Slot(self._mjcf_root, 'applied', size)
-    self._stored_slot = state.Slot(self._mjcf_root, 'stored', size)
-    self._obstruction_slot = state.Slot(self._mjcf_root, 'obstruction', size)
-    self._clean_slot = state.Slot(self._mjcf_root, 'clean', size)
-    self._origin_slot = state.Slot(self._mjcf_root, 'origin', 3)
+    self._slots = state.Slots(
+        self._mjcf_root,
+        applied=size,
+        stored=size,
+        obstruction=size,
+        clean=size,
+        origin=3,
+    )
     self._blocks = self._build_blocks()
     self._borrowed: block_kinds.Block | None = None
     self._measure_initial: Callable[[protocols.Physics], Any] | None = None
@@ -235,7 +238,7 @@ class Register(kinds.Kind):
     if displacement.any():
       origin[..., :2] += displacement
       first.put(physics, origin)
-    self._origin_slot.set(physics, origin)
+    self._slots.of(physics).origin[...] = origin
     shape = (*origin.shape[:-1], *self._shape)
     initial = np.array(self._initial)
     if self._measure_initial is not None and is_initialized:
@@ -325,15 +328,24 @@ class Register(kinds.Kind):
       where: axes.Mask = None,
   ) -> None:
     """Stores the result of a write, whose value is clean for now."""
-    self._applied_slot.set(physics, applied, where)
-    self._clean_slot.set(physics, applied, where)
-    self._obstruction_slot.set(physics, obstruction, where)
+    slots = self._slots.of(physics)
+    contents = [
+        (slots.applied, applied),
+        (slots.clean, applied),
+        (slots.obstruction, obstruction),
+    ]
     if self._channel == 'secure':
-      self._stored_slot.set(physics, applied, where)
+      contents.append((slots.stored, applied))
+    for array, value in contents:
+      array[...] = value if where is None else axes.merge(where, value, array)
 
   def _saturated(self, value: np.ndarray) -> np.ndarray:
     """Returns values, `(...)`, saturated to the range."""
-    return checks.saturated(value, self.value_range, self._name, self.PORTS)
+    fits = (value >= self._low) & (value <= self._high)  # False for NaN.
+    if axes.everywhere(fits):
+      return value
+    checks.refuse_infinite(value, self._name, self.PORTS)
+    return np.where(fits, value, np.clip(value, self._low, self._high))[()]
 
   def read(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the reading, `(...)`, in the register's units.
@@ -342,7 +354,7 @@ class Register(kinds.Kind):
       physics: One world or a batch of worlds.
     """
     if self._channel == 'secure':
-      return self._stored_slot.copy(physics)
+      return self._slots.of(physics).stored.copy()[()]
     return np.array(self._read_blocks(physics))[()]
 
   def applied(self, physics: protocols.Physics) -> np.ndarray:
@@ -351,7 +363,7 @@ class Register(kinds.Kind):
     Args:
       physics: One world or a batch of worlds.
     """
-    return self._applied_slot.copy(physics)
+    return self._slots.of(physics).applied.copy()[()]
 
   def clean(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the clean content, `(...)`, in the register's units.
@@ -363,7 +375,7 @@ class Register(kinds.Kind):
     Args:
       physics: One world or a batch of worlds.
     """
-    return self._clean_slot.copy(physics)
+    return self._slots.of(physics).clean.copy()[()]
 
   def set_clean(
       self, physics: protocols.Physics, value: Any, where: axes.Mask = None
@@ -380,7 +392,8 @@ class Register(kinds.Kind):
     """
     # Faster than `np.clip` for numbers; a nan stays.
     value = self.nearest(np.minimum(np.maximum(value, self._low), self._high))
-    self._clean_slot.set(physics, value, where)
+    clean = self._slots.of(physics).clean
+    clean[...] = axes.merge(where, value, clean)
 
   def obstruction(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the obstruction of the last write, `(...)`.
@@ -392,7 +405,7 @@ class Register(kinds.Kind):
     Args:
       physics: One world or a batch of worlds.
     """
-    return self._obstruction_slot.copy(physics)
+    return self._slots.of(physics).obstruction.copy()[()]
 
   def inspect(
       self,
@@ -412,13 +425,14 @@ class Register(kinds.Kind):
     Raises:
       SpecError: If the register reads anything but values of its spec.
     """
+    slots = self._slots.of(physics)
+    applied = slots.applied[()]
     reading = self.read(physics)
-    applied = self._applied_slot.get(physics)
     if self._channel == 'secure':
       permanent = np.zeros_like(reading)
     else:
       permanent = np.asarray(self._permanent(physics))[()]
-    obstruction = self._obstruction_slot.copy(physics)
+    obstruction = slots.obstruction.copy()[()]
     if reading.shape != applied.shape or reading.dtype != np.float64:
       raise checks.misreading(self, '_read_blocks', reading, applied)
     if permanent.shape != applied.shape:
@@ -432,5 +446,5 @@ class Register(kinds.Kind):
         obstruction,
         permanent,
         temporary,
-        self._clean_slot.copy(physics),
+        slots.clean.copy()[()],
     )

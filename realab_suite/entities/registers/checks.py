@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from realab_suite import errors
-from realab_suite.entities import axes
 from realab_suite.entities import protocols
 
 
@@ -26,32 +25,20 @@ def check_ports(name: str, ports: Sequence[str]) -> None:
     )
 
 
-def saturated(
-    value: np.ndarray,
-    value_range: tuple[float, float],
-    name: str,
-    ports: Sequence[str],
-) -> np.ndarray:
-  """Returns values that are saturated to the range of a register.
+def refuse_infinite(value: np.ndarray, name: str, ports: Sequence[str]) -> None:
+  """Refuses values that are not finite.
 
   Args:
     value: Values, `(...)`, or `(..., ports)`.
-    value_range: Lowest and highest value that can be stored.
     name: Name of the register.
     ports: Names of its ports.
 
   Raises:
     RegisterValueError: If a value is not finite.
   """
-  low, high = value_range
-  fits = (value >= low) & (value <= high)  # False for NaN.
-  if axes.everywhere(fits):
-    return value
   is_finite = np.isfinite(value)
   if not is_finite.all():
     raise _refusal(name, value, ~is_finite, 'must be finite', ports)
-  clipped: np.ndarray = np.where(fits, value, np.clip(value, low, high))[()]
-  return clipped
 
 
 def start_value(

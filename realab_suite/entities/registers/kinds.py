@@ -52,8 +52,7 @@ class Kind(modelled.ModelledEntity):
   _mass: float
   _blocks: list[block_kinds.Block]
   _borrowed: block_kinds.Block | None
-  _applied_slot: state.Slot
-  _origin_slot: state.Slot
+  _slots: state.Slots
 
   @abc.abstractmethod
   def _build_blocks(self) -> list[block_kinds.Block]:
@@ -126,7 +125,7 @@ class Kind(modelled.ModelledEntity):
 
     It is the corruption that readings have immediately after a write.
     """
-    return np.zeros_like(self._applied_slot.get(physics))
+    return np.zeros_like(self._slots.of(physics).applied)
 
   def nearest(self, value: Any) -> Any:
     """Returns the values that a write of values applies, `(...)`.
@@ -168,7 +167,7 @@ class Kind(modelled.ModelledEntity):
     Args:
       physics: One world or a batch of worlds.
     """
-    places = self._places(physics, self._applied_slot.get(physics))
+    places = self._places(physics, self._slots.of(physics).applied[()])
     moved = [
         np.linalg.norm(block.position(physics) - place, axis=-1)
         for block, place in zip(self._blocks, places, strict=True)
@@ -207,7 +206,8 @@ class Kind(modelled.ModelledEntity):
 
   def _origin(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the start position of the first block, `(..., 3)`, in m."""
-    return self._origin_slot.get(physics)
+    origin: np.ndarray = self._slots.of(physics).origin
+    return origin
 
   def _add_block(
       self,
