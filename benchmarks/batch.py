@@ -243,15 +243,15 @@ def _break_down_step(
     raw_us: float,
 ) -> list[timing.Figure]:
   """Returns the time of each part of a step, including the timers."""
-  task, mechanism, physics = env.task, env.mechanism, env.physics
+  task, phases, physics = env.task, env.mechanism.phases, env.physics
   parts = (
       ('substeps', physics, 'advance'),
       ('poses', physics, 'forward'),
       ('motors and hand', task.avatar, 'apply_action'),
       ('events of the world', task, 'latch_events'),
-      ('meters', mechanism, 'update_meters'),
-      ('providers', mechanism, 'update_providers'),
-      ("agent's reads", mechanism, 'read_for_agent'),
+      ('meters', phases, 'update_meters'),
+      ('providers', phases, 'update_providers'),
+      ("agent's reads", phases, 'read_for_agent'),
       ('casting rays', physics, 'cast_rays'),
       ('the rest of rays', task.avatar.rays, 'sense'),
       ('other senses', task, 'senses'),

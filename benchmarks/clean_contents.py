@@ -24,7 +24,6 @@ from realab_suite.engine import environment
 from realab_suite.entities import axes
 from realab_suite.entities.registers import base
 from realab_suite.feedback import clean_contents
-from realab_suite.feedback import mechanisms
 
 _SEED = 0
 _STEPS = 100
@@ -67,7 +66,7 @@ def _without() -> Iterator[None]:
   """Returns a context in which there are no clean contents."""
 
   def sight(*unused: Any) -> Any:
-    return mechanisms._Sight({}, np.False_)
+    return {}
 
   def clean(register: base.Register, physics: Any) -> Any:
     return register._slots.of(physics).applied[()]
@@ -85,11 +84,11 @@ def _without() -> Iterator[None]:
     if register.channel == 'secure':
       slots.stored[...] = axes.merge(where, applied, slots.stored)
 
-  mechanism = mechanisms.FeedbackMechanism
+  calls = clean_contents.CleanCalls
   with contextlib.ExitStack() as stack:
     for owner, name, new in (
-        (mechanism, '_sight', sight),
-        (mechanism, '_clean_call', lambda *unused: None),
+        (calls, 'see', sight),
+        (calls, 'repeat', lambda *unused: None),
         (base.Register, 'clean', clean),
         (base.Register, '_store', store),
     ):

@@ -155,15 +155,15 @@ def _break_down(
     env: environment.Environment, actions: np.ndarray, raw_us: float
 ) -> list[timing.Figure]:
   """Returns the time of each part of a step, including the timers."""
-  task, mechanism = env.task, env.mechanism
+  task, phases = env.task, env.mechanism.phases
   parts = (
       ('substeps', env.physics, 'advance'),
       ('poses', env.physics, 'update_poses'),
       ('motors and hand', task.avatar, 'apply_action'),
       ('events of the world', task, 'latch_events'),
-      ('meters', mechanism, 'update_meters'),
-      ('providers', mechanism, 'update_providers'),
-      ("agent's reads", mechanism, 'read_for_agent'),
+      ('meters', phases, 'update_meters'),
+      ('providers', phases, 'update_providers'),
+      ("agent's reads", phases, 'read_for_agent'),
       ('rays', task.avatar.rays, 'sense'),
       ('other senses', task, 'senses'),
       ('the rest', env, 'step'),

@@ -20,7 +20,6 @@ from campaigns import planting
 from tests.leaks import mutants as leaks
 
 _ENVIRONMENT = 'engine/environment.py'
-_SESSION = 'engine/session.py'
 _CONTROL_STEP = 'engine/control_step.py'
 _HANDS = 'tests/entities/moving_test.py', 'tests/entities/carrying_test.py'
 _EPISODES = 'engine/episodes.py'
@@ -64,10 +63,8 @@ MUTANTS = [
         'contract', 'finding 3: after a physics error the episode continues',
         _ENVIRONMENT,
         '''    self._reset_next_step = True
-    own = self._session
     try:''',
-        '''    own = self._session
-    try:''',
+        '    try:',
         _ENV,
     ),
     planting.Mutant(
@@ -77,8 +74,8 @@ MUTANTS = [
     ),
     planting.Mutant(
         'contract', 'finding 4: a divergence is an ordinary end',
-        _SESSION,
-        'self.end(events.End.DIVERGENCE)', 'self.end(events.End.TIMEOUT)',
+        _ENVIRONMENT,
+        'self._end(events.End.DIVERGENCE)', 'self._end(events.End.TIMEOUT)',
         _ENV,
     ),
     planting.Mutant(
@@ -107,8 +104,8 @@ MUTANTS = [
     ),
     planting.Mutant(
         'contract', 'finding 6: discounts may be anything', _HOSTS,
-        'self._per_world(self._task.get_discount(physics), np.float64)',
-        'self._per_world(np.nan, np.float64)', _ENV,
+        'self._as_number(self._task.get_discount(physics))',
+        'self._as_number(np.nan)', _ENV,
     ),
     planting.Mutant(
         'contract', 'finding 6: an observation is aliased', _OBSERVING,
@@ -119,11 +116,11 @@ MUTANTS = [
         'contract', 'finding 7: a step after a failed reset is not FIRST',
         _ENVIRONMENT,
         '''    self.abandon()
-    own = self._session
+    self._episode += 1
 ''',
         '''    self.abandon()
     self._reset_next_step = False
-    own = self._session
+    self._episode += 1
 ''', _ENV,
     ),
     planting.Mutant(
@@ -159,9 +156,9 @@ MUTANTS = [
       raise errors.ClosedError(''', _ENV,
     ),
     planting.Mutant(
-        'contract', 'an episode is one step too long', _SESSION,
-        'self._mechanism.step_count(physics) == self._max_steps',
-        'self._mechanism.step_count(physics) - 1 == self._max_steps',
+        'contract', 'an episode is one step too long', _ENVIRONMENT,
+        'outcome.num_steps == self._max_steps',
+        'outcome.num_steps - 1 == self._max_steps',
         _ENV,
     ),
     planting.Mutant(
@@ -177,19 +174,19 @@ MUTANTS = [
     ),
     planting.Mutant(
         'contract', 'meters do not measure', _CONTROL_STEP,
-        '''  records += mechanism.update_meters(view, where())
+        '''  records += phases.update_meters(view, where() if where else None)
 ''', '', _MECH,
     ),
     planting.Mutant(
         'contract', 'queries are not written', _CONTROL_STEP,
-        '''  records += mechanism.write_queries(view, queries)
+        '''  records += phases.write_queries(view, queries)
 ''', '', _MECH,
     ),
     planting.Mutant(
         'contract', 'a provider that raises leaves the episode open',
-        _SESSION,
+        _ENVIRONMENT,
         '''    except Exception:
-      self.end(events.End.ERROR)
+      self._end(events.End.ERROR)
       raise
 ''',
         '''    except Exception:
@@ -201,8 +198,10 @@ MUTANTS = [
         'if not is_finite.all():', 'if not is_finite.any() and False:', _REG,
     ),
     planting.Mutant(
-        'contract', 'a register does not saturate', _CHECKS,
-        'np.where(fits, value, np.clip(value, low, high))[()]', 'value', _REG,
+        'contract', 'a register does not saturate',
+        'entities/registers/base.py',
+        'np.where(fits, value, np.clip(value, self._low, self._high))[()]',
+        'value', _REG,
     ),
     planting.Mutant(
         'contract', 'a pose is written to a held block', 'entities/grasps.py',

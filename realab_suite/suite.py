@@ -21,10 +21,9 @@ from realab_suite.config import messages
 from realab_suite.config import task_names
 from realab_suite.engine import arguments
 from realab_suite.engine import batch_environment
+from realab_suite.engine import embedding
 from realab_suite.engine import environment
-from realab_suite.engine import foreign
 from realab_suite.engine import forking
-from realab_suite.engine import hosts
 from realab_suite.engine import seeding
 from realab_suite.feedback import mechanisms
 from realab_suite.feedback import specs
@@ -377,7 +376,7 @@ def embed(
     )
   except BaseException:
     # Allows embedding a corrected design in the same task.
-    foreign.make_host(task).remove_registers(mechanism)
+    embedding.remove_registers(task, mechanism)
     mechanism.detach_from_root()
     raise
 
@@ -392,9 +391,8 @@ def _connected(
     measurements: Mapping[str, Callable[[Any], Any]],
 ) -> environment.Environment:
   """Returns the environment of a task with an attached mechanism."""
-  host = foreign.make_host(task)
-  _connect_meters(host, mechanism, measurements)
-  host.add_registers(mechanism)
+  embedding.connect_meters(task, mechanism, measurements)
+  embedding.add_registers(task, mechanism)
   env = environment.Environment(
       task,
       mechanism,
@@ -408,27 +406,6 @@ def _connected(
     env.check_placement()
     stack.pop_all()
   return env
-
-
-def _connect_meters(
-    host: hosts.Host,
-    mechanism: mechanisms.FeedbackMechanism,
-    added: Mapping[str, Callable[[Any], Any]],
-) -> None:
-  """Connects the meters of a mechanism to a task.
-
-  Raises:
-    SpecError: If a meter measures what this world does not offer, or if an
-      added measurement has the name of another one.
-  """
-  functions = {'score': mechanism.score, **host.functions}
-  for name in added:
-    if name in functions:
-      raise errors.SpecError(
-          f'measurements: {name!r} is measured by the task; allowed are names'
-          f' other than {sorted(functions)}'
-      )
-  mechanism.connect({**functions, **added}, host.parts, host.privileged_senses)
 
 
 def _keywords(argument: str, value: Any) -> dict[str, Any]:

@@ -4,14 +4,15 @@ from collections.abc import Collection, Sequence
 import math
 from typing import Any, final
 
+from dm_control import composer
 from dm_env import specs
 import numpy as np
 
 from realab_suite import errors
-from realab_suite.engine import hosts
 from realab_suite.feedback import mechanisms
 from realab_suite.feedback import specs as feedback_specs
 from realab_suite.policies import action_sets
+from realab_suite.tasks import base
 
 # Types of the number of an action; bool is another type than int.
 _INTEGERS = int, np.int32, np.int64
@@ -201,18 +202,20 @@ def _element_names(control_spec: Any) -> list[str]:
 
 
 def action_set_of(
-    host: hosts.Host, design: feedback_specs.DesignSpec
+    task: composer.Task, design: feedback_specs.DesignSpec
 ) -> action_sets.ActionSet:
   """Returns the actions that policies choose from.
 
   Args:
-    host: Host of the task.
+    task: Task of this package, or a foreign one.
     design: Design whose action set counts; without one, that of the task.
   """
   chosen = design.action_set
   if chosen is not None:
     return action_sets.get(chosen.name, chosen.version)
-  return host.action_set
+  if isinstance(task, base.Task):
+    return task.ACTION_SET
+  return action_sets.DMLAB_LIKE
 
 
 def for_design(

@@ -23,6 +23,7 @@ from realab_suite.engine import hosts
 from realab_suite.engine import observing
 from realab_suite.engine import seeding
 from realab_suite.engine import snapshots
+from realab_suite.entities import axes
 from realab_suite.feedback import mechanisms
 from realab_suite.policies import action_sets
 from realab_suite.tasks import base
@@ -83,7 +84,7 @@ class BatchEnvironment:
     self._is_pending = np.ones(num_envs, bool)
     num_providers = len(self._mechanism.design.providers)
     self._keys = np.zeros((num_providers, num_envs, 2), np.uint64)
-    self._states = self._mechanism.initial_states((num_envs,))
+    self._states = self._mechanism.phases.initial_states((num_envs,))
     self._observation: dict[str, np.ndarray] = {}
     self._sinks: list[events.BatchEventSink] = []
     self._closed = False
@@ -234,25 +235,26 @@ class BatchEnvironment:
     self._is_pending = np.ones(self._num_envs, bool)
     last_valid = self._observation
     try:
-      records, ending, self._states = control_step.run(
+      outcome = control_step.run(
           self._physics,
           self._host,
-          self._mechanism,
+          self._mechanism.phases,
           self._single.schedule,
           self._single.num_substeps,
           queries=queries,
           controls=controls,
-          observation={
-              **self._observation,
-              **self._observer.added(self._physics),
-          },
+          observation=self._observer.for_providers(
+              self._physics, self._observation
+          ),
           provider_keys=self._keys,
           provider_states=self._states,
-          where=lambda: ~(is_first | self._physics.has_diverged()),
+          where=lambda: axes.both(
+              ~(is_first | self._physics.has_diverged()), None
+          ),
       )
+      self._states, ending = outcome.provider_states, outcome.ending
       has_failed = self._physics.has_diverged() & ~is_first
-      step_count = self._mechanism.step_count(self._physics)
-      is_late = step_count == self._single.max_steps
+      is_late = outcome.num_steps == self._single.max_steps
       self._begin_episodes(is_first)
       reads = self._observe()
     except Exception:
@@ -260,7 +262,7 @@ class BatchEnvironment:
       self._notify_of_ends(~is_first, events.End.ERROR)
       raise
     is_over = ending.is_ending
-    is_signalled = self._mechanism.ends_episode(reads) & ~is_first
+    is_signalled = self._mechanism.phases.ends_episode(reads) & ~is_first
     is_last = (has_failed | is_over | is_signalled | is_late) & ~is_first
     ends = episodes.ends_of_step(has_failed, is_over, is_signalled, is_last)
     for name, value in self._observation.items():
@@ -270,7 +272,7 @@ class BatchEnvironment:
         ends,
         is_first=is_first,
         has_failed=has_failed,
-        records=records,
+        records=outcome.records,
         agent_reads=reads,
         action=np.array(actions),
         true_reward=ending.true_reward,
@@ -442,7 +444,7 @@ class BatchEnvironment:
     (worlds,) = np.nonzero(where)
     if not len(worlds):
       return
-    self._states = self._mechanism.restart_states(
+    self._states = self._mechanism.phases.restart_states(
         self._states, worlds, self._num_envs
     )
     self._physics.reset(worlds)
@@ -484,7 +486,7 @@ class BatchEnvironment:
         world=self._world_numbers,
         episode=self._episodes.copy(),
         ends=ends,
-        initial=self._mechanism.initial_writes(self._physics),
+        initial=self._mechanism.phases.initial_writes(self._physics),
         **others,
     )
     for sink in self._sinks:

@@ -13,7 +13,7 @@ import numpy as np
 from realab_suite.engine import hosts
 from realab_suite.entities import axes
 from realab_suite.entities import registers
-from realab_suite.feedback import mechanisms
+from realab_suite.feedback import phases as mechanism_phases
 from realab_suite.feedback import specs
 
 
@@ -25,17 +25,19 @@ class Outcome(NamedTuple):
     records: Writes and reads, in order of time.
     ending: Reward, discount and end of the episode, as the task returns them.
     provider_states: State of each provider after the step.
+    num_steps: Number of completed control steps of the episode, `(...)`.
   """
 
   records: list[registers.Record]
   ending: hosts.Ending
   provider_states: list[Any]
+  num_steps: Any
 
 
 def run(
     physics: hosts.SteppedPhysics,
     host: hosts.Host,
-    mechanism: mechanisms.FeedbackMechanism,
+    phases: mechanism_phases.Phases,
     schedule: specs.ScheduleSpec,
     num_substeps: int,
     *,
@@ -44,26 +46,26 @@ def run(
     observation: dict[str, np.ndarray],
     provider_keys: np.ndarray,
     provider_states: Sequence[Any],
-    where: Callable[[], axes.Mask] = lambda: None,
+    where: Callable[[], axes.Mask] | None = None,
 ) -> Outcome:
   """Runs a control step. The caller observes and notifies the sinks.
 
   Args:
     physics: Physics of one world or of a batch.
     host: Host of the task.
-    mechanism: Registers, meters and providers.
+    phases: Phases of the mechanism.
     schedule: Substeps after which meters and providers act.
     num_substeps: Number of substeps in a control step.
     queries: Values for the query registers, `(..., queries)`.
     controls: Controls of the task, `(..., controls)`.
-    observation: Observation that the action responds to, by name.
+    observation: Observation that the action responds to, with what providers
+      alone sense, by name.
     provider_keys: Random key of each provider in this episode, `(providers,
       ..., 2)` uint64.
     provider_states: State of each provider.
     where: Function that returns the worlds of a batch in which meters and
       providers write, `(worlds,)` bool: all except worlds that begin an episode
-      after this step, and worlds that have failed. For a single world, it
-      returns `None`.
+      after this step, and worlds that have failed; `None` for a single world.
 
   Raises:
     PhysicsError: If the physics of a single world has failed. In a batch, a
@@ -75,16 +77,20 @@ def run(
   was_over = host.is_over(physics)
   host.begin_step(physics, controls)
   records: list[registers.Record] = []
-  records += mechanism.write_queries(view, queries)
+  records += phases.write_queries(view, queries)
 
   host.advance(physics, controls, schedule.meter_substep, is_last=False)
   is_ending = host.is_over(physics)
-  records += mechanism.update_meters(view, where())
+  records += phases.update_meters(view, where() if where else None)
 
   between = schedule.provider_substep - schedule.meter_substep
   host.advance(physics, controls, between, is_last=False)
-  feedback, next_states = mechanism.update_providers(
-      view, observation, provider_keys, provider_states, where()
+  feedback, next_states = phases.update_providers(
+      view,
+      observation,
+      provider_keys,
+      provider_states,
+      where() if where else None,
   )
   records += feedback
 
@@ -92,5 +98,7 @@ def run(
   host.advance(physics, controls, rest, is_last=True)
   ending = host.end_step(physics, was_over, is_ending)
   reward = ending.true_reward
-  mechanism.end_step(physics, axes.choose(axes.is_finite(reward), reward, 0.0))
-  return Outcome(records, ending, next_states)
+  num_steps = phases.end_step(
+      physics, axes.choose(axes.is_finite(reward), reward, 0.0)
+  )
+  return Outcome(records, ending, next_states, num_steps)

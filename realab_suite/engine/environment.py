@@ -4,7 +4,7 @@ Only this module and `foreign` use private attributes of `composer.Environment`.
 They are those of dm_control 1.0.50, and a test fails when they change.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, final
 
 from dm_control import composer
@@ -20,11 +20,12 @@ from realab_suite.engine import control_step
 from realab_suite.engine import episodes
 from realab_suite.engine import events
 from realab_suite.engine import foreign
+from realab_suite.engine import hooks
 from realab_suite.engine import observing
 from realab_suite.engine import seeding
-from realab_suite.engine import session
 from realab_suite.engine import single_physics
 from realab_suite.engine import snapshots
+from realab_suite.entities import registers
 from realab_suite.entities import state
 from realab_suite.feedback import mechanisms
 from realab_suite.feedback import specs
@@ -63,16 +64,17 @@ class Environment(composer.Environment):
     self._selected_senses = senses
     self._physics: Any
     self._mechanism = mechanism
+    self._phases = mechanism.phases
     mechanism.leave_phases()
     self._max_steps = max_steps
     self._closed = False
     self._has_extra_hooks = False
     self._host = host = foreign.make_host(task)
-    host.refuse_uncalled_hooks()
+    hooks.refuse_uncalled(task)
     super().__init__(
         task,
         random_state=seeding.random_state(seed, world, 0, 'construction'),
-        recompile_mjcf_every_episode=host.is_recompiled,
+        recompile_mjcf_every_episode=host.IS_RECOMPILED,
     )
     host.start(
         mechanism,
@@ -85,9 +87,14 @@ class Environment(composer.Environment):
     self._codec = action_codec.for_design(
         task.action_spec(self._physics_proxy), mechanism
     )
-    self._session = session.Session(
-        mechanism, host, self._observer, max_steps, seed, world
-    )
+    self._seed, self._world, self._episode = seed, world, -1
+    # True after the sinks were notified of the start of an episode, until they
+    # are notified of its end.
+    self._is_open = False
+    self._keys = self._new_keys(0)
+    self._states: list[Any] = []
+    self._observation: dict[str, np.ndarray] = {}
+    self._sinks: list[events.EventSink] = []
     self._start_check = host.start_check(self._physics, mechanism)
 
   # The interface for evaluators and launchers. Agents do not get this object.
@@ -110,12 +117,12 @@ class Environment(composer.Environment):
   @property
   def seed(self) -> int:
     """Seed of every random stream."""
-    return self._session.seed
+    return self._seed
 
   @property
   def world(self) -> int:
     """Number of the world in a batch; 0 for a single world."""
-    return self._session.world
+    return self._world
 
   @property
   def max_steps(self) -> int | None:
@@ -125,7 +132,7 @@ class Environment(composer.Environment):
   @property
   def action_set(self) -> action_sets.ActionSet:
     """Actions that policies choose from: the design's, or the task's."""
-    return action_codec.action_set_of(self._host, self._mechanism.design)
+    return action_codec.action_set_of(self._task, self._mechanism.design)
 
   @property
   def senses(self) -> tuple[str, ...]:
@@ -183,24 +190,23 @@ class Environment(composer.Environment):
       SpecError: If this environment never calls such a hook.
     """
     self._refuse_if_closed()
-    self._host.refuse_extra_hook(hook_name)
+    hooks.refuse_unused(self._task, hook_name)
     super().add_extra_hook(hook_name, hook_callable)
     self._has_extra_hooks = True
 
   @property
   def sinks(self) -> list[events.EventSink]:
     """Event sinks, in the order in which they were added."""
-    return [*self._session.sinks]
+    return [*self._sinks]
 
   def add_sink(self, sink: events.EventSink) -> None:
     """Abandons the current episode and notifies a sink of all later ones."""
-    self._refuse_if_closed()
-    self._session.add_sink(sink)
-    self._reset_next_step = True
+    self.abandon()
+    self._sinks.append(sink)
 
   def remove_sink(self, sink: events.EventSink) -> None:
     """Undoes `add_sink`."""
-    self._session.remove_sink(sink)
+    self._sinks.remove(sink)
 
   def rewind(self, episode: int = 0, random: Any = None) -> None:
     """Abandons the current episode and sets the number of the next one.
@@ -215,9 +221,9 @@ class Environment(composer.Environment):
     self._refuse_if_closed()
     episode = integers.check('episode', episode, 0)
     if random is not None:
-      self._session.seed = seeding.as_seed(random)
+      self._seed = seeding.as_seed(random)
     self.abandon()
-    self._session.episode = episode - 1
+    self._episode = episode - 1
 
   def abandon(self, end: events.End = events.End.ABANDONED) -> None:
     """Ends the current episode, if there is one. The next step resets.
@@ -226,7 +232,7 @@ class Environment(composer.Environment):
       end: Reason that the sinks get.
     """
     self._refuse_if_closed()
-    self._session.end(end)
+    self._end(end)
     self._reset_next_step = True
 
   def save(self) -> snapshots.Snapshot:
@@ -239,19 +245,18 @@ class Environment(composer.Environment):
       StateLayoutError: If a provider's state is not plain data.
     """
     header = self.snapshot_header()
-    own = self._session
     worlds = snapshots.WorldStates(
         indices=None,
         physics=snapshots.get_state(self._physics)[np.newaxis],
-        seed=[own.seed],
-        world=[own.world],
-        episode=[own.episode],
+        seed=[self._seed],
+        world=[self._world],
+        episode=[self._episode],
         is_pending=[self._reset_next_step],
-        is_open=[own.is_open],
-        provider_keys=[key[np.newaxis] for key in own.keys],
-        provider_states=own.states,
-        observation=snapshots.of_batch(own.observation),
-        sinks=[[sink.state_kind, [sink.state()]] for sink in own.sinks],
+        is_open=[self._is_open],
+        provider_keys=[key[np.newaxis] for key in self._keys],
+        provider_states=self._states,
+        observation=snapshots.of_batch(self._observation),
+        sinks=[[sink.state_kind, [sink.state()]] for sink in self._sinks],
         random_state=self._random_state.get_state(legacy=False),
     )
     return snapshots.Snapshot(header, worlds.to_data())
@@ -277,27 +282,24 @@ class Environment(composer.Environment):
           f'the snapshot has {len(saved.seed)} worlds; allowed here is one, as'
           ' in batch.save([3])'
       )
-    own = self._session
-    saved.refuse_other_sinks([sink.state_kind for sink in own.sinks])
+    saved.refuse_other_sinks([sink.state_kind for sink in self._sinks])
     # If anything fails from here on, the next step starts with a reset.
     self.abandon()
     snapshots.set_state(self._physics, saved.physics[0])
-    (own.seed,), (own.world,), (own.episode,) = (
-        saved.seed,
-        saved.world,
-        saved.episode,
-    )
+    (self._seed,), (self._world,) = saved.seed, saved.world
+    (self._episode,) = saved.episode
     if saved.random_state is None:  # A world of a batch has no generator.
-      seeding.reseed(self._random_state, own.seed, own.world, 0, 'construction')
+      stream = self._seed, self._world, 0, 'construction'
+      seeding.reseed(self._random_state, *stream)
     else:
       self._random_state.set_state(saved.random_state)
-    for key, saved_key in zip(own.keys, saved.provider_keys, strict=True):
+    for key, saved_key in zip(self._keys, saved.provider_keys, strict=True):
       key[:] = saved_key[0]
-    own.states = saved.provider_states_of_world()
-    own.observation = observing.frozen(saved.observation_of_world())
-    for sink, (_, states) in zip(own.sinks, saved.sinks, strict=False):
+    self._states = saved.provider_states_of_world()
+    self._observation = observing.frozen(saved.observation_of_world())
+    for sink, (_, states) in zip(self._sinks, saved.sinks, strict=False):
       sink.set_state(states[0])
-    (own.is_open,) = saved.is_open
+    (self._is_open,) = saved.is_open
     (self._reset_next_step,) = saved.is_pending
 
   def check_start(self, physics: Any) -> None:
@@ -321,11 +323,9 @@ class Environment(composer.Environment):
       SpecError: If the task is foreign, or if its bodies can sleep.
     """
     self._refuse_if_closed()
-    dynamics = self._host.dynamics
+    model = self._physics.model if model is None else model
     return {
-        **snapshots.describe(self._physics.model if model is None else model),
-        'task': type(self._task).__name__,
-        'dynamics': dynamics,
+        **snapshots.describe(self._task, model),
         'design': self._mechanism.design.digest(),
         'num_substeps': self._n_sub_steps,
         'max_steps': self._max_steps,
@@ -358,19 +358,25 @@ class Environment(composer.Environment):
     """
     # If anything fails from here on, the next step starts with a reset.
     self.abandon()
-    own = self._session
-    own.episode += 1
+    self._episode += 1
     episodes.begin(
         self._random_state,
-        own.seed,
-        own.world,
-        own.episode,
+        self._seed,
+        self._world,
+        self._episode,
         self._initialize_episode,
     )
-    own.restart_providers()
-    own.start(self._physics)
+    self._keys = self._new_keys(self._episode)
+    self._states = self._phases.initial_states(())
+    records: list[registers.Record] = []
+    records += self._phases.initial_writes(self._physics)
+    records += self._observe()
+    start = events.Start(self._seed, self._world, self._episode, records)
+    self._notify(lambda sink: sink.episode_started(start, self._physics))
+    # The episode is open only after every sink was notified without an error.
+    self._is_open = True
     self._reset_next_step = False
-    return dm_env.restart(observing.copied(own.observation))
+    return dm_env.restart(observing.copied(self._observation))
 
   def step(self, action: Any) -> dm_env.TimeStep:
     """Runs one control step and returns its time step.
@@ -387,18 +393,48 @@ class Environment(composer.Environment):
       return self.reset()
     # If anything fails here, the next step starts with a reset.
     self._reset_next_step = True
-    own = self._session
     try:
-      with own.ending_on_failure():
-        outcome = self._control_step(queries, controls)
-        reads = own.observe(self._physics)
+      outcome = control_step.run(
+          self._physics,
+          self._host,
+          self._phases,
+          self._schedule,
+          self._n_sub_steps,
+          queries=queries,
+          controls=controls,
+          observation=self._observer.for_providers(
+              self._physics, self._observation
+          ),
+          provider_keys=self._keys,
+          provider_states=self._states,
+      )
+      reads = self._observe()
     except control.PhysicsError:
+      self._end(events.End.DIVERGENCE)
       # MuJoCo has reset the state. The agent gets the previous observation.
-      return episodes.time_step(events.End.DIVERGENCE, 1.0, own.observation)
-    end = own.finish_step(self._physics, outcome, reads, action)
+      return episodes.time_step(events.End.DIVERGENCE, 1.0, self._observation)
+    except Exception:
+      self._end(events.End.ERROR)
+      raise
+    self._states, ending = outcome.provider_states, outcome.ending
+    if self._sinks:
+      step = events.Step(
+          [*outcome.records, *reads],
+          np.array(action),
+          np.array(ending.true_reward),
+          ending.failure,
+      )
+      self._notify(lambda sink: sink.step_ended(step, self._physics))
+    end = episodes.end_of_step(
+        False,
+        ending.is_ending,
+        self._phases.ends_episode(reads),
+        outcome.num_steps == self._max_steps,
+    )
+    if end is not None:
+      self._end(end)
     self._reset_next_step = end is not None
-    discount = float(outcome.ending.discount)
-    return episodes.time_step(end, discount, own.observation)
+    return episodes.time_step(end, float(ending.discount), self._observation)
 
   def close(self) -> None:
     """Frees the world. Closing it again has no effect."""
@@ -414,21 +450,30 @@ class Environment(composer.Environment):
         ' environment where it is used'
     )
 
-  def _control_step(
-      self, queries: np.ndarray, controls: np.ndarray
-  ) -> control_step.Outcome:
-    return control_step.run(
-        self._physics,
-        self._host,
-        self._mechanism,
-        self._schedule,
-        self._n_sub_steps,
-        queries=queries,
-        controls=controls,
-        observation=self._session.inputs(self._physics),
-        provider_keys=self._session.keys,
-        provider_states=self._session.states,
-    )
+  def _observe(self) -> list[registers.Read]:
+    """Updates the observation and returns the reads of registers for it."""
+    observation, reads = self._observer.observe(self._physics)
+    self._observation = observing.frozen(observation)
+    return reads
+
+  def _notify(self, notify: Callable[[events.EventSink], None]) -> None:
+    """Notifies the sinks, which may read the physics."""
+    if self._sinks:
+      with self._host.unchanged(self._physics):
+        for sink in self._sinks:
+          notify(sink)
+
+  def _end(self, end: events.End) -> None:
+    """Notifies the sinks of the end of the episode, if there is one."""
+    if self._is_open:
+      self._is_open = False
+      for sink in self._sinks:
+        sink.episode_ended(end)
+
+  def _new_keys(self, episode: int) -> np.ndarray:
+    """Returns the random key of each provider in an episode."""
+    number = len(self._mechanism.design.providers)
+    return episodes.provider_keys(self._seed, self._world, episode, number)
 
   def _initialize_episode(self, unused_attempt: int) -> None:
     if self._recompile_mjcf_every_episode:
@@ -449,8 +494,8 @@ class Environment(composer.Environment):
       self._physics.free()
     model = self._task.root_entity.mjcf_model
     with state.room_for_slots(model):
-      self._physics = self._host.physics_class.from_mjcf_model(model)
-    self._physics.legacy_step = self._host.LEGACY_STEP
+      self._physics = self._host.PHYSICS.from_mjcf_model(model)
+    self._physics.legacy_step = self._host.IS_RECOMPILED
 
   def _refuse_if_closed(self) -> None:
     if self._closed:

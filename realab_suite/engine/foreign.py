@@ -6,7 +6,7 @@ foreign task may have hooks in substeps, may keep state in Python, and is
 compiled for each episode. Batches and snapshots therefore do not support it.
 """
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 import contextlib
 import functools
 from typing import Any, final
@@ -18,17 +18,14 @@ from dm_env import specs
 import mujoco
 import numpy as np
 
-from realab_suite import errors
 from realab_suite.engine import clearance
 from realab_suite.engine import gl_contexts
 from realab_suite.engine import hosts
 from realab_suite.engine import observing
 from realab_suite.engine import placement
 from realab_suite.engine import replacement
-from realab_suite.entities import avatars
 from realab_suite.entities import views
 from realab_suite.feedback import mechanisms
-from realab_suite.policies import action_sets
 from realab_suite.tasks import base
 
 
@@ -85,7 +82,8 @@ class ForeignHost(hosts.Host):
   was embedded. Observables that are enabled later are not observed.
   """
 
-  LEGACY_STEP = True
+  PHYSICS = ForeignPhysics
+  IS_RECOMPILED = True
 
   def __init__(self, task: composer.Task) -> None:
     """Initializes the host.
@@ -99,53 +97,6 @@ class ForeignHost(hosts.Host):
     self._updater: hosts.UpdaterOf = lambda: self.make_updater(None)
     self._view: views.View | None = None
     self._has_registers = False
-
-  @property
-  def action_set(self) -> action_sets.ActionSet:
-    return action_sets.DMLAB_LIKE
-
-  @property
-  def functions(self) -> Mapping[str, Callable[[Any], Any]]:
-    return {}
-
-  @property
-  def parts(self) -> None:
-    """All parts and bodies of the world."""
-
-  def add_registers(self, mechanism: mechanisms.FeedbackMechanism) -> None:
-    """Makes registers graspable for this package's avatars in the world."""
-    for avatar in self._avatars():
-      avatar.make_graspable(_blocks_of(mechanism))
-
-  def remove_registers(self, mechanism: mechanisms.FeedbackMechanism) -> None:
-    for avatar in self._avatars():
-      avatar.forget(_blocks_of(mechanism))
-
-  def _avatars(self) -> list[avatars.Avatar]:
-    entities = self._task.root_entity.iter_entities()
-    return [one for one in entities if isinstance(one, avatars.Avatar)]
-
-  def refuse_uncalled_hooks(self) -> None:
-    """Does nothing, because all hooks are called as in Composer."""
-
-  def refuse_extra_hook(self, hook_name: str) -> None:
-    """Does nothing, because all hooks are called as in Composer."""
-
-  @property
-  def physics_class(self) -> type[mjcf.Physics]:
-    return ForeignPhysics
-
-  @property
-  def is_recompiled(self) -> bool:
-    return True
-
-  @property
-  def dynamics(self) -> int:
-    raise errors.SpecError(
-        f'{type(self._task).__name__} cannot be saved or restored: only a'
-        ' realab_suite.tasks.base.Task is compiled once and keeps no state in'
-        ' Python'
-    )
 
   def make_updater(
       self, senses: Sequence[str] | None, added: Collection[str] = ()
@@ -249,14 +200,6 @@ class ForeignHost(hosts.Host):
   def sense_spec(self) -> dict[str, specs.Array]:
     return self._sense_spec
 
-  @property
-  def default_senses(self) -> Sequence[str]:
-    return tuple(self._sense_spec)
-
-  @property
-  def privileged_senses(self) -> Mapping[str, Callable[[Any], np.ndarray]]:
-    return getattr(self._task, 'privileged_senses', {})
-
   def sense(
       self, physics: hosts.SteppedPhysics, names: Collection[str]
   ) -> dict[str, np.ndarray]:
@@ -307,27 +250,17 @@ class ForeignHost(hosts.Host):
     if self._has_registers:
       self.view(physics).open(physics)
 
-  def is_over(self, physics: hosts.SteppedPhysics) -> bool:
-    del physics  # Composer checks only at the end of a step.
-    return False
-
   def end_step(
       self, physics: hosts.SteppedPhysics, was_over: Any, is_ending: Any
   ) -> hosts.Ending:
     del was_over, is_ending
-    reward, failure = hosts.true_reward(
-        lambda: float(self._task.get_reward(physics)), np.nan
-    )
+    reward, failure = hosts.true_reward(self._task, physics, float)
     return hosts.Ending(
         reward,
         failure,
         float(self._task.get_discount(physics)),
         bool(self._task.should_terminate_episode(physics)),
     )
-
-
-def _blocks_of(mechanism: mechanisms.FeedbackMechanism) -> list[Any]:
-  return [b for r in mechanism.registers.values() for b in r.own_blocks]
 
 
 def check_start(

@@ -12,17 +12,17 @@ _NEVER_CALLED = ('initialize_episode_mjcf', 'before_substep', 'after_substep')
 _UNUSED = (*_NEVER_CALLED, 'after_compile')
 
 
-def refuse_unused(task: base.Task, hook_name: str) -> None:
+def refuse_unused(task: composer.Task, hook_name: str) -> None:
   """Refuses an extra hook that a task of this package never calls.
 
   Args:
-    task: Task of the environment.
+    task: Task of the environment; a foreign one calls all hooks.
     hook_name: One of `composer.HOOK_NAMES`.
 
   Raises:
     SpecError: If the engine never calls such a hook.
   """
-  if hook_name in _UNUSED:
+  if isinstance(task, base.Task) and hook_name in _UNUSED:
     allowed = [
         name for name in composer_environment.HOOK_NAMES if name not in _UNUSED
     ]
@@ -33,12 +33,14 @@ def refuse_unused(task: base.Task, hook_name: str) -> None:
     )
 
 
-def refuse_uncalled(task: base.Task) -> None:
-  """Refuses a task with hooks that the engine never calls.
+def refuse_uncalled(task: composer.Task) -> None:
+  """Refuses a task of this package with hooks that the engine never calls.
 
   Raises:
     SpecError: If the task or one of its entities has such a hook.
   """
+  if not isinstance(task, base.Task):
+    return
   parts = [(task, composer.Task)]
   parts += [(e, composer.Entity) for e in task.root_entity.iter_entities()]
   for part, kind in parts:

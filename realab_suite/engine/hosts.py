@@ -1,10 +1,10 @@
 """Hosts: everything that depends on the kind of task.
 
 `control_step` defines the order of events. A host compiles and advances the
-physics, detects the end of the episode and returns the senses, and it says what
-meters can measure. This module contains the interface and the host of this
-package's tasks; `foreign` contains the host of foreign tasks. No other module
-of the engine asks which kind a task is of.
+physics, detects the end of the episode and returns the senses. This module
+contains the interface and the host of this package's tasks; `foreign` contains
+the host of foreign tasks. `embedding` has what differs before the world is
+compiled.
 """
 
 import abc
@@ -14,6 +14,7 @@ import functools
 import traceback
 from typing import Any, ClassVar, NamedTuple, NoReturn, Protocol, final
 
+from dm_control import composer
 from dm_control import mjcf
 from dm_control.composer import observation as composer_observation
 from dm_control.rl import control
@@ -22,15 +23,11 @@ import numpy as np
 
 from realab_suite import errors
 from realab_suite.config import messages
-from realab_suite.engine import hooks
 from realab_suite.engine import placement
 from realab_suite.engine import single_physics
 from realab_suite.entities import axes
-from realab_suite.entities import block_kinds
-from realab_suite.entities import measurables
 from realab_suite.entities import protocols
 from realab_suite.feedback import mechanisms
-from realab_suite.policies import action_sets
 from realab_suite.tasks import base
 
 
@@ -75,18 +72,6 @@ class SteppedPhysics(protocols.Physics, Protocol):
     """
 
 
-class StepHooks(Protocol):
-  """Hooks of a control step, of a task alone or with those of its entities."""
-
-  def before_step(
-      self, physics: SteppedPhysics, action: Any, random_state: Any
-  ) -> None:
-    """Runs before the first substep."""
-
-  def after_step(self, physics: SteppedPhysics, random_state: Any) -> None:
-    """Runs after the last substep."""
-
-
 UpdaterOf = Callable[[], composer_observation.Updater]
 """Function that returns the observation updater of the compiled model."""
 
@@ -97,79 +82,16 @@ class Host(abc.ABC):
   It is made before the physics is compiled. `start` completes it.
 
   Attributes:
-    LEGACY_STEP: True if the physics is stepped as in Composer, from derived
-      quantities.
+    PHYSICS: Class of the physics of one world.
+    IS_RECOMPILED: True if the model may change between episodes, and the
+      physics is stepped as in Composer, from derived quantities.
   """
 
-  LEGACY_STEP: ClassVar[bool]
+  PHYSICS: ClassVar[type[mjcf.Physics]]
+  IS_RECOMPILED: ClassVar[bool]
 
-  # What the world offers and takes, before it is compiled.
+  _task: composer.Task
 
-  @property
-  @abc.abstractmethod
-  def action_set(self) -> action_sets.ActionSet:
-    """Actions of people, and of policies that act in any world."""
-
-  @property
-  @abc.abstractmethod
-  def functions(self) -> Mapping[str, Callable[[Any], Any]]:
-    """Functions of the task that meters can measure, by name."""
-
-  @property
-  @abc.abstractmethod
-  def parts(self) -> Mapping[str, measurables.Measurable] | None:
-    """Parts that meters can measure; see `FeedbackMechanism.connect`."""
-
-  @abc.abstractmethod
-  def add_registers(self, mechanism: mechanisms.FeedbackMechanism) -> None:
-    """Adds registers that have been attached to the task's root entity.
-
-    Raises:
-      SpecError: If the task does not allow them.
-    """
-
-  @abc.abstractmethod
-  def remove_registers(self, mechanism: mechanisms.FeedbackMechanism) -> None:
-    """Undoes `add_registers`."""
-
-  @abc.abstractmethod
-  def refuse_uncalled_hooks(self) -> None:
-    """Refuses a task with hooks that are never called.
-
-    Raises:
-      SpecError: If the task or one of its entities has such a hook.
-    """
-
-  @abc.abstractmethod
-  def refuse_extra_hook(self, hook_name: str) -> None:
-    """Refuses an extra hook that is never called.
-
-    Raises:
-      SpecError: If it is one of those.
-    """
-
-  # The compiled world.
-
-  @property
-  @abc.abstractmethod
-  def physics_class(self) -> type[mjcf.Physics]:
-    """Class of the physics of one world."""
-
-  @property
-  @abc.abstractmethod
-  def is_recompiled(self) -> bool:
-    """True if the model may change between episodes."""
-
-  @property
-  @abc.abstractmethod
-  def dynamics(self) -> int:
-    """Version of the task's dynamics, for snapshots.
-
-    Raises:
-      SpecError: If the state of the task cannot be saved.
-    """
-
-  @abc.abstractmethod
   def make_updater(
       self, senses: Sequence[str] | None, added: Collection[str] = ()
   ) -> composer_observation.Updater:
@@ -182,6 +104,8 @@ class Host(abc.ABC):
     Raises:
       SpecError: If the task does not offer a sense.
     """
+    del senses, added
+    return composer_observation.Updater({})
 
   @abc.abstractmethod
   def check_placement(
@@ -255,24 +179,21 @@ class Host(abc.ABC):
     """Returns the physics through which the phases access registers."""
     return physics
 
-  def latch_events(self, physics: Any) -> None:
-    """Records the events of the substeps so far, if the task does that."""
-    del physics
-
   @property
   @abc.abstractmethod
   def sense_spec(self) -> dict[str, specs.Array]:
     """Specs of the senses that the task offers, by name."""
 
   @property
-  @abc.abstractmethod
   def default_senses(self) -> Sequence[str]:
     """Names of the senses of an agent for which none are selected."""
+    return tuple(self.sense_spec)
 
   @property
-  @abc.abstractmethod
   def privileged_senses(self) -> Mapping[str, Callable[[Any], np.ndarray]]:
     """Functions of the physics that providers may sense; see `Task`."""
+    senses: Mapping[str, Any] = getattr(self._task, 'privileged_senses', {})
+    return senses
 
   @abc.abstractmethod
   def sense(
@@ -282,10 +203,7 @@ class Host(abc.ABC):
 
   @abc.abstractmethod
   def begin_step(self, physics: SteppedPhysics, controls: np.ndarray) -> None:
-    """Passes the controls of a step, `(..., controls)`, to the task.
-
-    In a plain Composer environment, this method and `advance` are not called.
-    """
+    """Passes the controls of a step, `(..., controls)`, to the task."""
 
   @abc.abstractmethod
   def advance(
@@ -304,13 +222,14 @@ class Host(abc.ABC):
       is_last: True if these are the last substeps of the control step.
     """
 
-  @abc.abstractmethod
   def is_over(self, physics: SteppedPhysics) -> Any:
     """Returns True for worlds whose episode the task has ended, `(...)` bool.
 
     For a foreign task it is always False, because Composer checks only at the
     end of a step.
     """
+    del physics
+    return False
 
   @abc.abstractmethod
   def end_step(
@@ -336,7 +255,10 @@ class WorldHost(Host):
   after the ending do not count.
   """
 
-  LEGACY_STEP = False  # Steps begin from the state; see `ThinPhysics`.
+  PHYSICS = single_physics.ThinPhysics
+  IS_RECOMPILED = False  # Steps begin from the state; see `ThinPhysics`.
+
+  _task: base.Task
 
   def __init__(
       self, task: base.Task, batch_shape: tuple[int, ...] = ()
@@ -348,10 +270,17 @@ class WorldHost(Host):
       batch_shape: `()` for one world, `(worlds,)` for a batch.
     """
     self._task = task
-    self._hooks: StepHooks = task
+    self._hooks: Any = task
     self._random_state: np.random.RandomState | None = None
     self._batch_shape = batch_shape
-    self._unknown_reward = self._per_world(np.nan, np.float64)
+    # What a task returns may be one value for all worlds.
+    self._as_bool: Callable[[Any], Any] = np.bool_
+    self._as_number: Callable[[Any], Any] = np.float64
+    if batch_shape:
+      self._as_bool, self._as_number = (
+          functools.partial(_per_world, batch_shape, kind)
+          for kind in (np.bool_, np.float64)
+      )
 
   @functools.cached_property
   def _expected(self) -> dict[str, tuple[tuple[int, ...], np.dtype[Any]]]:
@@ -360,64 +289,6 @@ class WorldHost(Host):
         name: ((*self._batch_shape, *spec.shape), spec.dtype)
         for name, spec in self._task.sense_spec.items()
     }
-
-  @property
-  def action_set(self) -> action_sets.ActionSet:
-    return self._task.ACTION_SET
-
-  @property
-  def functions(self) -> Mapping[str, Callable[[Any], Any]]:
-    return self._task.measurements
-
-  @property
-  def parts(self) -> Mapping[str, measurables.Measurable]:
-    return self._task.measurables
-
-  def add_registers(self, mechanism: mechanisms.FeedbackMechanism) -> None:
-    """Adds registers whose blocks fit the substeps of the task.
-
-    The environment designer decides on the physics of a world. If the blocks of
-    a design changed the substeps, designs would not be compared in the same
-    world.
-
-    Args:
-      mechanism: Registers, meters and providers.
-
-    Raises:
-      SpecError: If the substeps are too long for a block, or if the task does
-        not allow the registers.
-    """
-    for name, register in mechanism.registers.items():
-      for block in register.blocks:
-        _refuse_misfit(name, block, self._task.physics_timestep)
-    self._task.add_registers([*mechanism.registers.values()])
-
-  def remove_registers(self, mechanism: mechanisms.FeedbackMechanism) -> None:
-    self._task.remove_registers([*mechanism.registers.values()])
-
-  def refuse_uncalled_hooks(self) -> None:
-    hooks.refuse_uncalled(self._task)
-
-  def refuse_extra_hook(self, hook_name: str) -> None:
-    hooks.refuse_unused(self._task, hook_name)
-
-  @property
-  def physics_class(self) -> type[mjcf.Physics]:
-    return single_physics.ThinPhysics
-
-  @property
-  def is_recompiled(self) -> bool:
-    return False
-
-  @property
-  def dynamics(self) -> int:
-    return self._task.DYNAMICS_VERSION
-
-  def make_updater(
-      self, senses: Sequence[str] | None, added: Collection[str] = ()
-  ) -> composer_observation.Updater:
-    del senses, added  # They are no observables.
-    return composer_observation.Updater({})
 
   def check_placement(
       self, physics: Any, mechanism: mechanisms.FeedbackMechanism, start: Any
@@ -456,10 +327,6 @@ class WorldHost(Host):
   @property
   def default_senses(self) -> Sequence[str]:
     return self._task.default_senses
-
-  @property
-  def privileged_senses(self) -> Mapping[str, Callable[[Any], np.ndarray]]:
-    return self._task.privileged_senses
 
   def sense(
       self, physics: SteppedPhysics, names: Collection[str]
@@ -521,22 +388,14 @@ class WorldHost(Host):
     elif num_substeps:  # `after_step` latches the last events.
       self._task.latch_events(physics)
 
-  def latch_events(self, physics: Any) -> None:
-    self._task.latch_events(physics)
-
   def is_over(self, physics: SteppedPhysics) -> Any:
-    return self._per_world(
-        self._task.should_terminate_episode(physics), np.bool_
-    )
+    return self._as_bool(self._task.should_terminate_episode(physics))
 
   def end_step(
       self, physics: SteppedPhysics, was_over: Any, is_ending: Any
   ) -> Ending:
-    reward, failure = true_reward(
-        lambda: self._per_world(self._task.get_reward(physics), np.float64),
-        self._unknown_reward,
-    )
-    discount = self._per_world(self._task.get_discount(physics), np.float64)
+    reward, failure = true_reward(self._task, physics, self._as_number)
+    discount = self._as_number(self._task.get_discount(physics))
     return Ending(
         axes.choose(was_over, 0.0, reward),
         failure,
@@ -545,44 +404,33 @@ class WorldHost(Host):
         is_ending,
     )
 
-  def _per_world(self, value: Any, kind: type[np.generic]) -> Any:
-    """Returns a value for each world; the task may return one for all."""
-    if not self._batch_shape:
-      return kind(value)
-    return np.array(np.broadcast_to(value, self._batch_shape), kind)
 
-
-def true_reward(get: Callable[[], Any], unknown: Any) -> tuple[Any, str | None]:
-  """Returns a true reward, or `unknown` and the traceback of an exception.
+def true_reward(
+    task: composer.Task, physics: Any, as_number: Callable[[Any], Any]
+) -> tuple[Any, str | None]:
+  """Returns a true reward; or NaN and the traceback of an exception.
 
   An exception that reached the agent could reveal the reward. The traceback is
   for the evaluator only, and the episode counts as failed.
 
   Args:
-    get: Function that returns the reward.
-    unknown: Reward to return if `get` raises an exception.
+    task: Task that returns the reward.
+    physics: Physics of one world or of a batch.
+    as_number: Function that returns what the task returns as numbers, `(...)`.
 
   Raises:
     PhysicsError: If the physics has failed, which is not an error of the task.
   """
   try:
-    return get(), None
+    return as_number(task.get_reward(physics)), None
   except control.PhysicsError:
     raise
   except Exception:
-    return unknown, traceback.format_exc()
+    return as_number(np.nan), traceback.format_exc()
 
 
-def _refuse_misfit(
-    name: str, block: block_kinds.Block, physics_timestep: float
-) -> None:
-  """Raises a SpecError if the substeps of a task are too long for a block."""
-  misfit = block_kinds.find_misfit(block, physics_timestep)
-  if misfit is not None:
-    remedy = {'physics_timestep': block_kinds.SHORT_SUBSTEP}
-    raise errors.SpecError(
-        f'register {name!r}: {misfit.given}; the substeps of'
-        f' {1000 * physics_timestep:g} ms of the task {misfit.effect}; allowed'
-        f' are {misfit.allowed}, and others if the task takes short substeps:'
-        f' task_kwargs={remedy}'
-    )
+def _per_world(
+    shape: tuple[int, ...], kind: type[np.generic], value: Any
+) -> np.ndarray:
+  """Returns a value for each world; the task may return one for all."""
+  return np.array(np.broadcast_to(value, shape), kind)

@@ -11,6 +11,7 @@ from realab_suite.config import messages
 from realab_suite.engine import hosts
 from realab_suite.entities import meters
 from realab_suite.entities import registers
+from realab_suite.feedback import clean_contents
 from realab_suite.feedback import mechanisms
 from realab_suite.feedback import providers
 from realab_suite.policies import base as policies_base
@@ -53,6 +54,7 @@ class Observer:
     """
     self._host = host
     self._mechanism = mechanism
+    self._phases = mechanism.phases
     self._max_steps = max_steps
     of_task = host.sense_spec
     if max_steps is not None and TIME_LEFT in of_task:
@@ -131,26 +133,32 @@ class Observer:
       reads of registers for it.
     """
     observation = self._sense(physics, self._keys, self._has_time_left)
-    reads = self._mechanism.read_for_agent(physics)
+    reads = self._phases.read_for_agent(physics)
     for read in reads:
       observation[f'registers/{read.register}'] = np.array(read.reading)
     return observation, reads
 
-  def added(self, physics: hosts.SteppedPhysics) -> dict[str, np.ndarray]:
-    """Returns what providers sense beside the agent's observation, by key.
+  def for_providers(
+      self, physics: hosts.SteppedPhysics, observation: dict[str, np.ndarray]
+  ) -> dict[str, np.ndarray]:
+    """Returns an observation with what providers alone sense, by key.
 
-    The state is that of the last observation, so that a provider responds to
-    what the agent does. It is never part of observations.
+    The state is that of the observation, so that a provider responds to what
+    the agent does.
 
     Args:
       physics: Physics of one world or of a batch, before a control step.
+      observation: Last observation of the agent.
     """
-    found = self._sense(physics, self._added, self._adds_time_left)
+    if not (self._added or self._adds_time_left or self._privileged):
+      return observation
+    added = self._sense(physics, self._added, self._adds_time_left)
     for key, function in self._privileged.items():
-      found[key] = np.array(function(physics))
+      added[key] = np.array(function(physics))
       if isinstance(function, meters.Instrument):
-        found[mechanisms.IDEAL + key] = np.array(function.ideal(physics))
-    return found
+        ideal = np.array(function.ideal(physics))
+        added[clean_contents.IDEAL + key] = ideal
+    return {**observation, **added}
 
   def _sense(
       self,
@@ -165,14 +173,14 @@ class Observer:
       keys: Keys of senses of the task, by name.
       has_time_left: True with the time that is left, which is not one of them.
     """
-    found = {}
+    senses = {}
     if keys:
-      sensed = self._host.sense(physics, keys)
-      found = {keys[name]: value for name, value in sensed.items()}
+      for name, value in self._host.sense(physics, keys).items():
+        senses[keys[name]] = value
     if has_time_left:
       spent = self._mechanism.step_count(physics) / self._max_steps
-      found[f'senses/{TIME_LEFT}'] = np.asarray(1.0 - spent, np.float32)
-    return found
+      senses[f'senses/{TIME_LEFT}'] = np.asarray(1.0 - spent, np.float32)
+    return senses
 
 
 def refuse_unknown(selected: Sequence[str], offered: Collection[str]) -> None:

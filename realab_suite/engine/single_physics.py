@@ -39,7 +39,7 @@ class ThinPhysics(mjcf.Physics):
     self._compiled = data.model
     self._pointers = data.model.ptr, data.ptr
     self._num_warnings = data.ptr.warning.number
-    self._has_old_poses = True
+    self.has_old_poses = True
     super()._reload_from_data(data)
     self._thin: dict[Any, _ThinBinding] = {}
     # One for each size of frames, (height, width).
@@ -60,14 +60,15 @@ class ThinPhysics(mjcf.Physics):
       PhysicsError: If MuJoCo issued a warning.
     """
     mujoco.mj_step1(*self._pointers)
-    self._dirty = self._has_old_poses = False
-    self._refuse_warnings()
+    self._dirty = self.has_old_poses = False
+    if any(self._num_warnings.tolist()):
+      raise _failure(self._num_warnings)
 
   def update_poses(self) -> None:
     """Updates the poses of bodies, geoms and sites if the state has changed."""
-    if self._has_old_poses:
+    if self.has_old_poses:
       mujoco.mj_kinematics(*self._pointers)
-      self._has_old_poses = False
+      self.has_old_poses = False
 
   def check(self) -> None:
     """Checks the positions and velocities that the last substep resulted in.
@@ -77,7 +78,8 @@ class ThinPhysics(mjcf.Physics):
     """
     mujoco.mj_checkPos(*self._pointers)
     mujoco.mj_checkVel(*self._pointers)
-    self._refuse_warnings()
+    if any(self._num_warnings.tolist()):
+      raise _failure(self._num_warnings)
 
   @property
   def state(self) -> np.ndarray:
@@ -89,7 +91,7 @@ class ThinPhysics(mjcf.Physics):
 
   def mark_as_dirty(self) -> None:
     """Marks derived quantities as out of date."""
-    self._dirty = self._has_old_poses = True
+    self._dirty = self.has_old_poses = True
 
   def refresh(self) -> None:
     """Calls `forward` if the state has changed since the last call."""
@@ -111,8 +113,9 @@ class ThinPhysics(mjcf.Physics):
         so nothing may be read from it.
     """
     mujoco.mj_step(*self._pointers, num_substeps)
-    self._dirty = self._has_old_poses = True
-    self._refuse_warnings()
+    self._dirty = self.has_old_poses = True
+    if any(self._num_warnings.tolist()):
+      raise _failure(self._num_warnings)
 
   def _make_rendering_contexts(self) -> None:
     """Creates the contexts for `render`.
@@ -121,10 +124,6 @@ class ThinPhysics(mjcf.Physics):
       RenderingError: If no renderer is available.
     """
     self._contexts = gl_contexts.for_pictures(self.model)
-
-  def _refuse_warnings(self) -> None:
-    if any(self._num_warnings.tolist()):
-      raise control.PhysicsError(_warnings(self._num_warnings))
 
   def free(self) -> None:
     """Frees the world, which must not be used afterwards."""
@@ -201,7 +200,8 @@ def _pose_property(name: str) -> property:
   """Returns a property for a pose, which is updated when it is read."""
 
   def get(self: '_ThinBinding') -> np.ndarray:
-    self._physics.update_poses()
+    if self._physics.has_old_poses:
+      self._physics.update_poses()
     try:
       return self._reads[name]
     except KeyError:
@@ -255,7 +255,7 @@ class _ThinBinding(mjcf_physics.Binding):
     array, index = self._writes.get(name) or self._find(name)
     array[index] = value
     if name != 'ctrl':
-      self._physics.mark_as_dirty()
+      self._physics._dirty = self._physics.has_old_poses = True
 
   def _find(self, name: str) -> tuple[np.ndarray, Any]:
     """Finds and caches the array of an attribute and the index in it."""
@@ -283,6 +283,7 @@ class _ThinBinding(mjcf_physics.Binding):
     return copy
 
 
-def _warnings(numbers: np.ndarray) -> str:
+def _failure(numbers: np.ndarray) -> control.PhysicsError:
+  """Returns an error for warnings of MuJoCo, given the number of each."""
   raised = [mujoco.mjtWarning(int(i)).name for i in np.flatnonzero(numbers)]
-  return f'MuJoCo warnings: {", ".join(raised)}'
+  return control.PhysicsError(f'MuJoCo warnings: {", ".join(raised)}')

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 import hashlib
 from typing import Any, NamedTuple, Self, final
 
+from dm_control import composer
 from dm_control import mjcf
 import mujoco
 import numpy as np
@@ -19,6 +20,7 @@ from realab_suite import trees
 from realab_suite.config import messages
 from realab_suite.engine import arguments
 from realab_suite.entities import state
+from realab_suite.tasks import base
 
 _KIND = 'snapshot'
 # Version of the contents. Since version 2, states of providers are those of
@@ -304,15 +306,23 @@ def replaced(old: np.ndarray, indices: np.ndarray, values: Any) -> np.ndarray:
   return copy
 
 
-def describe(model: Any) -> dict[str, Any]:
-  """Returns the entries of a snapshot's header that describe a model.
+def describe(task: composer.Task, model: Any) -> dict[str, Any]:
+  """Returns the entries of a snapshot's header that describe a world.
 
   Args:
+    task: Its task.
     model: Compiled model, as `physics.model`.
 
   Raises:
-    SpecError: If bodies can sleep, because MuJoCo does not export which do.
+    SpecError: If the task is foreign, or if bodies can sleep, because MuJoCo
+      does not export which do.
   """
+  if not isinstance(task, base.Task):
+    raise errors.SpecError(
+        f'{type(task).__name__} cannot be saved or restored: only a'
+        ' realab_suite.tasks.base.Task is compiled once and keeps no state in'
+        ' Python'
+    )
   refuse_sleep(model)
   compiled = np.empty(mujoco.mj_sizeModel(model.ptr), np.uint8)
   mujoco.mj_saveModel(model.ptr, None, compiled)
@@ -321,6 +331,8 @@ def describe(model: Any) -> dict[str, Any]:
       'mujoco': mujoco.__version__,
       'model': hashlib.sha256(compiled.tobytes()).hexdigest()[:16],
       'slots': state.layout(model),
+      'task': type(task).__name__,
+      'dynamics': task.DYNAMICS_VERSION,
   }
 
 

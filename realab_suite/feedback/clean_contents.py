@@ -20,7 +20,7 @@ The state of a provider in a mechanism is a dict:
   differs: True where the two are different, `(...)` bool.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 import contextlib
 import copy
 from typing import Any, Final, NamedTuple, final
@@ -30,9 +30,11 @@ import numpy as np
 from realab_suite import trees
 from realab_suite.entities import axes
 from realab_suite.entities import protocols
-from realab_suite.entities.registers import ports
+from realab_suite.entities.registers import ports as register_ports
+from realab_suite.entities.registers import records
 from realab_suite.feedback import provider_results
 from realab_suite.feedback import providers
+from realab_suite.feedback import specs
 
 NEGLIGIBLE_METRES: Final = 1e-6
 """Smaller displacements count as 0 wherever they are shown or decide."""
@@ -40,7 +42,13 @@ NEGLIGIBLE_METRES: Final = 1e-6
 NEGLIGIBLE_SHARE: Final = 1e-6
 """Share of the range of a register, above which displacements count."""
 
+IDEAL: Final = 'ideal/'
+"""Prefix of keys of ideal measurements of what providers sense."""
+
 ACTUAL, CLEAN, DIFFERS = 'actual', 'clean', 'differs'
+
+Content = tuple[Any, Any, Any, float]
+"""Arguments of `is_disturbed`."""
 
 Guard = Callable[[], contextlib.AbstractContextManager[None]]
 
@@ -84,6 +92,122 @@ class Contents(NamedTuple):
   where: np.ndarray
   writes: Mapping[str, provider_results.RequestedWrite]
   state: dict[str, Any]
+
+
+@final
+class Call(NamedTuple):
+  """A call of a provider with readings.
+
+  Attributes:
+    inputs: Arguments of the call.
+    reads: Reads of registers among them.
+    ideal: Ideal measurements of what the provider senses, by key.
+    sight: Readings that the agent observed; see `CleanCalls.see`.
+    before: State of the provider in the mechanism before the call.
+    after: State after it, if the clean call gives the same; see `following`.
+  """
+
+  inputs: Inputs
+  reads: Sequence[records.Read]
+  ideal: Mapping[str, np.ndarray]
+  sight: Mapping[str, Content]
+  before: Mapping[str, Any]
+  after: dict[str, Any]
+
+
+@final
+class CleanCalls:
+  """The calls of the providers of a mechanism with clean contents."""
+
+  def __init__(
+      self,
+      design: specs.DesignSpec,
+      ports: Mapping[str, register_ports.AnyPort],
+  ) -> None:
+    """Initializes the calls.
+
+    Args:
+      design: Design of the mechanism.
+      ports: Ports of its registers, by name.
+    """
+    self._ports = ports
+    self._tolerances = {
+        name: tolerance(spec.scale, spec.range)
+        for name, spec in design.ports.items()
+    }
+    self._read_by_agent = design.names(*specs.READ_BY_AGENTS)
+
+  def see(
+      self, physics: protocols.Physics, observation: providers.Observation
+  ) -> dict[str, Content]:
+    """Returns the contents of the registers in an observation, by key.
+
+    Args:
+      physics: One world or a batch of worlds, in which no provider has written
+        since the observation.
+      observation: Observation that the agent's action responds to.
+    """
+    seen = {}
+    for name in self._read_by_agent:
+      port, key = self._ports[name], f'registers/{name}'
+      applied, clean = port.applied(physics), port.clean(physics)
+      seen[key] = observation[key][()], applied, clean, self._tolerances[name]
+    return seen
+
+  def repeat(
+      self,
+      physics: protocols.Physics,
+      provider: providers.Provider,
+      call: Call,
+      where: axes.Mask,
+      guard: Guard,
+  ) -> Contents | None:
+    """Repeats a call with clean contents.
+
+    The provider is called in the worlds in which an input or its state differs
+    from that.
+
+    Args:
+      physics: One world or a batch of worlds.
+      provider: The provider.
+      call: Its call with readings.
+      where: Worlds in which it may write, `(...)` bool; `None` for all worlds.
+      guard: Context manager of the call.
+
+    Returns:
+      Clean contents of the registers that the provider writes; `None` if
+      nothing differs, or the provider is not repeatable.
+    """
+    if not provider.is_repeatable:
+      return None
+    inputs = call.inputs
+    needs = call.before[DIFFERS]
+    for key, value in call.ideal.items():
+      differs = np.asarray(inputs.observation[key] != value)
+      own_axes = tuple(range(np.ndim(inputs.episode_start), differs.ndim))
+      needs = needs | differs.any(axis=own_axes)
+    seen = {}
+    for read in call.reads:
+      applied = self._ports[read.register].applied(physics)
+      most = self._tolerances[read.register]
+      seen[read.register] = read.reading, applied, read.clean, most
+    for content in (*call.sight.values(), *seen.values()):
+      needs = needs | is_disturbed(*content)
+    if where is not None:
+      needs = needs & where
+    if not axes.anywhere(needs):
+      return None
+    shown, readings = (
+        {name: undisturbed(*of) for name, of in group.items()}
+        for group in (call.sight, seen)
+    )
+    clean = Inputs(
+        {**inputs.observation, **shown, **call.ideal},
+        readings,
+        inputs.episode_start,
+        inputs.key,
+    )
+    return _contents(provider, clean, call.before, call.after, needs, guard)
 
 
 def initial_state(state: Any, batch_shape: tuple[int, ...]) -> dict[str, Any]:
@@ -153,7 +277,7 @@ def following(
   return {ACTUAL: actual, CLEAN: clean, DIFFERS: differs}
 
 
-def call(
+def _contents(
     provider: providers.Provider,
     inputs: Inputs,
     state: Mapping[str, Any],
@@ -201,7 +325,7 @@ def call(
 
 def store(
     physics: protocols.Physics,
-    port: ports.AnyPort,
+    port: register_ports.AnyPort,
     contents: Contents,
     before: Any,
 ) -> None:

@@ -81,7 +81,7 @@ class ComposerHooks(composer.Entity):
     del physics, random_state
     self._episode += 1
     self._keys = None
-    self._states = self._mechanism.initial_states(())
+    self._states = self._mechanism.phases.initial_states(())
 
   def before_step(self, physics: Any, random_state: Any) -> None:
     """Reads the registers that the agent's action responds to."""
@@ -97,21 +97,21 @@ class ComposerHooks(composer.Entity):
     self._view.open(physics)
     self._observation = {
         f'registers/{read.register}': np.array(read.reading)
-        for read in self._mechanism.read_for_agent(self._view)
+        for read in self._mechanism.phases.read_for_agent(self._view)
     }
 
   def before_substep(self, physics: Any, random_state: Any) -> None:
     """Runs the phases that follow the substeps so far."""
     del random_state
-    now, mechanism, view = self._num_done, self._mechanism, self._view
+    now, phases, view = self._num_done, self._mechanism.phases, self._view
     meter_substep, provider_substep = self._substeps
     if now not in (meter_substep, provider_substep):
       return
     view.open(physics)
     if now == meter_substep:
-      mechanism.update_meters(view)
+      phases.update_meters(view)
     if now == provider_substep:
-      _, self._states = mechanism.update_providers(
+      _, self._states = phases.update_providers(
           view, self._observation, self._keys, self._states
       )
     view.refresh()
@@ -137,7 +137,7 @@ class ComposerHooks(composer.Entity):
           f'num_substeps: {expected}; allowed is {done}, as in a control step'
           ' of this environment'
       )
-    self._mechanism.end_step(physics, 0.0)
+    self._mechanism.phases.end_step(physics, 0.0)
 
   @property
   def _substeps(self) -> tuple[int, int]:

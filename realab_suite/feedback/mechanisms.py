@@ -1,16 +1,11 @@
-"""The feedback mechanism, which runs a design in a world.
+"""The feedback mechanism: a design, assembled in a world.
 
-It owns the registers and has one method for each phase of a control step that
-reads or writes them. The engine calls these methods and passes the returned
-records to event sinks. In an environment of Composer, the mechanism calls them
-itself, from Composer's hooks; see `composer_hooks`.
+`phases` has the parts of a control step in which it acts.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-import contextlib
-import copy
 import itertools
-from typing import Any, NamedTuple, final
+from typing import final
 
 from dm_control import composer
 from dm_control import mjcf
@@ -21,7 +16,6 @@ from realab_suite import errors
 from realab_suite.config import integers
 from realab_suite.config import messages
 from realab_suite.entities import arenas
-from realab_suite.entities import axes
 from realab_suite.entities import measurables
 from realab_suite.entities import meters
 from realab_suite.entities import modelled
@@ -29,40 +23,19 @@ from realab_suite.entities import protocols
 from realab_suite.entities import state
 from realab_suite.entities.registers import base
 from realab_suite.entities.registers import ports
-from realab_suite.entities.registers import records
 from realab_suite.feedback import assembly
-from realab_suite.feedback import clean_contents
 from realab_suite.feedback import composer_hooks
 from realab_suite.feedback import measurements
+from realab_suite.feedback import phases
 from realab_suite.feedback import provider_entities
-from realab_suite.feedback import provider_results
 from realab_suite.feedback import providers
+from realab_suite.feedback import register_writes
 from realab_suite.feedback import specs
-from realab_suite.policies import random_keys
 
 # Inside the mechanism, `ports` is the name of a property.
 _Port = ports.AnyPort
 
-Guard = clean_contents.Guard
-
-IDEAL = 'ideal/'
-"""Prefix of keys of ideal measurements of what providers sense."""
-
-
-@final
-class _Sight(NamedTuple):
-  """Readings in the observation of a control step.
-
-  Attributes:
-    seen: Arguments of `clean_contents.is_disturbed` of each reading, by key.
-    is_disturbed: True where a reading differs from them, `(...)` bool.
-  """
-
-  seen: dict[str, tuple[Any, Any, Any, float]]
-  is_disturbed: Any
-
-
-_Target = provider_entities.Target
+_Target = register_writes.Target
 
 
 @final
@@ -74,8 +47,8 @@ class FeedbackMechanism(modelled.ModelledEntity):
   does the same for designs with named places. `connect`
   connects the meters to functions of the task.
 
-  An environment of this package calls `leave_phases`, and then the methods for
-  the phases of a control step.
+  An environment of this package calls `leave_phases`, and then the phases of a
+  control step.
   """
 
   def _build(
@@ -102,8 +75,7 @@ class FeedbackMechanism(modelled.ModelledEntity):
       num_substeps = integers.check('num_substeps', num_substeps, 1)
     self._design = design
     self._mjcf_root = mjcf.RootElement(model='feedback')
-    self._step_count = state.Slot(self._mjcf_root, 'step_count')
-    self._score = state.Slot(self._mjcf_root, 'score')
+    self._counters = state.Slots(self._mjcf_root, step_count=None, score=None)
     self._registers = {
         name: assembly.make_register(name, spec, design)
         for name, spec in design.registers.items()
@@ -113,15 +85,9 @@ class FeedbackMechanism(modelled.ModelledEntity):
         for register in self._registers.values()
         for port in ports.of(register)
     }
-    self._tolerances = {
-        name: clean_contents.tolerance(spec.scale, spec.range)
-        for name, spec in design.ports.items()
-    }
     queries = design.names('query')
     self._queries = [self._ports[name] for name in queries]
-    self._query_targets = self._targets(queries)
     self._read_by_agent = design.names(*specs.READ_BY_AGENTS)
-    self._meters: list[tuple[tuple[str, ...], meters.Meter, _Target]] = []
     self._is_connected = False
     self._instruments: set[str] = set()
     self._asked: list[measurements.AskedRegisters] = []
@@ -136,7 +102,13 @@ class FeedbackMechanism(modelled.ModelledEntity):
         )
         for i, spec in enumerate(design.providers)
     ]
-    self._guard: Guard = contextlib.nullcontext
+    self._phases = phases.Phases(
+        design,
+        self._ports,
+        self._counters,
+        self._targets(queries),
+        self._providers,
+    )
     self._hooks: composer.Entity | None = composer_hooks.ComposerHooks(
         self, num_substeps
     )
@@ -164,7 +136,7 @@ class FeedbackMechanism(modelled.ModelledEntity):
 
     The hooks for Composer come last, after those of the registers.
     """
-    meters = [meter for _, meter, _ in self._meters]
+    meters = [meter for _, meter, _ in self._phases.meters]
     hooks = [] if self._hooks is None else [self._hooks]
     registers = super().iter_entities(exclude_self)
     return itertools.chain(registers, meters, self._providers, hooks)
@@ -172,6 +144,11 @@ class FeedbackMechanism(modelled.ModelledEntity):
   def leave_phases(self) -> None:
     """Leaves the phases of control steps to the caller."""
     self._hooks = None
+
+  @property
+  def phases(self) -> phases.Phases:
+    """Parts of a control step in which the mechanism acts."""
+    return self._phases
 
   @property
   def design(self) -> specs.DesignSpec:
@@ -211,7 +188,7 @@ class FeedbackMechanism(modelled.ModelledEntity):
     """
     return [
         name
-        for _, meter, target in self._meters
+        for _, meter, target in self._phases.meters
         if meter.can_be_obstructed
         for name in target.names
     ] + [
@@ -349,438 +326,19 @@ class FeedbackMechanism(modelled.ModelledEntity):
     for target in self._targets([*found]):
       writers, measures = zip(*map(found.get, target.names), strict=True)
       meter = meters.Meter(_joint(measures), target.register, self._mjcf_root)
-      self._meters.append((writers, meter, target))
+      self._phases.meters.append((writers, meter, target))
     self._is_connected = True
-
-  def guard_providers(self, guard: Guard) -> None:
-    """Sets the context manager in which each call of a provider runs.
-
-    Args:
-      guard: Function that returns a new context manager. An exception from the
-        context manager counts as an exception from the provider.
-    """
-    self._guard = guard
-
-  def initial_writes(self, physics: protocols.Physics) -> list[records.Write]:
-    """Returns the records of the writes of `initial` at the last reset."""
-    writes = []
-    for name, register in self._ports.items():
-      applied = register.applied(physics)
-      step = np.zeros(np.shape(applied), int)[()]
-      writes.append(
-          records.Write(
-              name,
-              records.INITIAL,
-              step,
-              applied,
-              applied,
-              register.obstruction(physics),
-              register.clean(physics),
-          )
-      )
-    return writes
-
-  def write_queries(
-      self, physics: protocols.Physics, values: np.ndarray
-  ) -> list[records.Write]:
-    """Writes the agent's queries K_t to the query registers.
-
-    Args:
-      physics: One world or a batch of worlds.
-      values: Queries, `(..., queries)`, in the order of `queries`.
-
-    Returns:
-      Records of the writes, in the order of `queries`.
-
-    Raises:
-      RegisterValueError: If a register cannot store a query.
-    """
-    if not self._queries:
-      return []
-    step = self._whole_steps(physics) + 1
-    writes = []
-    for target in self._query_targets:
-      if target.register.PORTS:
-        requested = values[..., target.columns]
-      else:
-        requested = values[..., target.columns[0]][()]
-      writers = (records.AGENT,) * len(target.ports)
-      writes += _write(physics, target, writers, step, requested)
-    return writes
-
-  def update_meters(
-      self, physics: protocols.Physics, where: axes.Mask = None
-  ) -> list[records.Write]:
-    """Measures with every meter, then writes the meter registers.
-
-    A write moves blocks, which other meters may measure. All meters therefore
-    measure first.
-
-    Args:
-      physics: One world or a batch of worlds.
-      where: Worlds whose registers are written, `(...)` bool; `None` for all
-        worlds.
-
-    Returns:
-      Records of the writes, in the design's order.
-
-    Raises:
-      RegisterValueError: If a register cannot store a measurement. The message
-        does not contain the measurement, because it may reach an agent.
-    """
-    if not self._meters:
-      return []
-    step = self._whole_steps(physics) + 1
-    where = axes.both(where, None)
-    values = [
-        (meter.measure(physics), meter.ideal(physics))
-        for _, meter, _ in self._meters
-    ]
-    writes = []
-    for one, (measured, ideal) in zip(self._meters, values, strict=True):
-      writers, _, target = one
-      try:
-        some = _write(physics, target, writers, step, measured, where)
-      except errors.RegisterValueError as error:
-        writer = ' and '.join(writers)
-        raise errors.RegisterValueError(
-            f'{_where(writer, step, error.world)}: register'
-            f' {target.register.name!r} cannot store the measured value',
-            error.world,
-        ) from error
-      if ideal is not None:
-        target.register.set_clean(physics, ideal, where)
-        some = self._with_clean(physics, some)
-      writes += some
-    return writes
-
-  def initial_states(self, batch_shape: tuple[int, ...]) -> list[Any]:
-    """Returns the initial states of the providers; see `clean_contents`.
-
-    Args:
-      batch_shape: `()` for one world, `(worlds,)` for a batch.
-
-    Raises:
-      FeedbackProviderError: If a provider or its guard raises, or if a state of
-        a batch contains a leaf that is not an array with an axis of worlds.
-    """
-    states = []
-    for one in self._providers:
-      where = f'{one.title}, before the first step'
-      try:
-        with self._guard():
-          state = one.spec.initial_state(batch_shape)
-      except Exception as error:
-        raise errors.FeedbackProviderError(
-            f'{where}: {messages.exception(error)}'
-        ) from error
-      if batch_shape:
-        provider_results.check_state(where, state, batch_shape)
-      states.append(clean_contents.initial_state(state, batch_shape))
-    return states
-
-  def update_providers(
-      self,
-      physics: protocols.Physics,
-      observation: providers.Observation,
-      keys: np.ndarray,
-      states: Sequence[Any],
-      where: axes.Mask = None,
-  ) -> tuple[list[records.Record], list[Any]]:
-    """Runs the providers in the design's order; each reads, then writes.
-
-    A provider with `every` is called only if it acts in some world, and keeps
-    its state in the other worlds. Where what it reads is disturbed, it is
-    called once more, with clean contents; see `clean_contents`.
-
-    Args:
-      physics: One world or a batch of worlds.
-      observation: Observation that the agent's action responds to.
-      keys: Random key of each provider in this episode, `(providers, ..., 2)`
-        uint64.
-      states: State of each provider.
-      where: Worlds whose registers may be written, `(...)` bool; `None` for all
-        worlds.
-
-    Returns:
-      Records of the reads and writes, in order, and the next states.
-
-    Raises:
-      FeedbackProviderError: If a provider or its guard raises, or if a provider
-        returns other writes than it declares, or values of a wrong shape.
-      RegisterValueError: If a register cannot store a value.
-    """
-    before = self._whole_steps(physics)
-    step = before + 1
-    is_start = np.asarray(step == 1)
-    keys_of_step = random_keys.of_step(keys, before)
-    sight = self._sight(physics, observation)
-    log: list[records.Record] = []
-    next_states = []
-    for i, provider in enumerate(self._providers):
-      acts = provider.spec.acts_in(step)
-      if axes.nowhere(acts):
-        next_states.append(states[i])
-        continue
-      reads = [
-          port.inspect(physics, provider.title, step) for port in provider.reads
-      ]
-      if acts is not None:
-        reads = [read._replace(where=acts) for read in reads]
-      ideal = {
-          key: observation[IDEAL + key]
-          for key in provider.seen
-          if IDEAL + key in observation
-      }
-      seen = {key: observation[key] for key in provider.seen}
-      inputs = clean_contents.Inputs(
-          {**seen, **ideal} if provider.is_secure else seen,
-          {read.register: read.reading for read in reads},
-          is_start,
-          keys_of_step[i],
-      )
-      values, state = self._call(i, step, inputs, states[i], acts)
-      may_write = axes.both(where, acts)
-      clean = self._clean_call(
-          physics, i, inputs, reads, sight, ideal, states[i], state, may_write
-      )
-      log += reads
-      log += self._write_all(physics, i, step, values, may_write, clean)
-      next_states.append(state if clean is None else clean.state)
-    return log, next_states
-
-  def _sight(
-      self, physics: protocols.Physics, observation: providers.Observation
-  ) -> _Sight:
-    """Compares the readings in an observation with the clean contents.
-
-    Providers have not written since the observation.
-    """
-    seen: dict[str, tuple[Any, Any, Any, float]] = {}
-    is_disturbed: Any = False
-    for name in self._read_by_agent:
-      register, key = self._ports[name], f'registers/{name}'
-      seen[key] = (
-          observation[key][()],
-          register.applied(physics),
-          register.clean(physics),
-          self._tolerances[name],
-      )
-      is_disturbed = is_disturbed | clean_contents.is_disturbed(*seen[key])
-    return _Sight(seen, is_disturbed)
-
-  def _call(
-      self,
-      i: int,
-      step: Any,
-      inputs: clean_contents.Inputs,
-      state: Mapping[str, Any],
-      acts: axes.Mask,
-  ) -> tuple[dict[str, provider_results.RequestedWrite], dict[str, Any]]:
-    """Calls a provider with readings.
-
-    Returns:
-      Its writes, and its next state if its clean call gives the same.
-    """
-    writer, provider = self._providers[i].title, self._providers[i].spec
-    before = state[clean_contents.ACTUAL]
-    try:
-      with self._guard():
-        # A change of the state in place must not reach the clean call.
-        returned = provider.step(*inputs.of_a_call(), copy.deepcopy(before))
-    except Exception as error:
-      raise errors.FeedbackProviderError(
-          f'{_where(writer, step)}: {messages.exception(error)}'
-      ) from error
-    try:
-      values, following = provider_results.checked(
-          provider, returned, step.shape
-      )
-      if acts is not None:
-        following = provider_results.merged('state', following, before, ~acts)
-    except errors.FeedbackProviderError as error:
-      raise errors.FeedbackProviderError(
-          f'{_where(writer, step)} {error}'
-      ) from error
-    return values, clean_contents.following(state, following, acts)
-
-  def _clean_call(
-      self,
-      physics: protocols.Physics,
-      i: int,
-      inputs: clean_contents.Inputs,
-      reads: Sequence[records.Read],
-      sight: _Sight,
-      ideal: Mapping[str, np.ndarray],
-      state: Mapping[str, Any],
-      following: dict[str, Any],
-      where: axes.Mask,
-  ) -> clean_contents.Contents | None:
-    """Calls a provider once more, with clean contents.
-
-    It is called in the worlds in which an input or its state differs from that.
-
-    Returns:
-      Clean contents of the registers that it writes; `None` if nothing differs,
-      or the provider is not repeatable.
-    """
-    provider = self._providers[i].spec
-    if not provider.is_repeatable:
-      return None
-    needs = state[clean_contents.DIFFERS] | sight.is_disturbed
-    for key, value in ideal.items():
-      differs = np.asarray(inputs.observation[key] != value)
-      own_axes = tuple(range(np.ndim(inputs.episode_start), differs.ndim))
-      needs = needs | differs.any(axis=own_axes)
-    seen = {}
-    for read in reads:
-      register = self._ports[read.register]
-      applied = register.applied(physics)
-      most = self._tolerances[read.register]
-      seen[read.register] = read.reading, applied, read.clean, most
-      needs = needs | clean_contents.is_disturbed(*seen[read.register])
-    if where is not None:
-      needs = needs & where
-    if not axes.anywhere(needs):
-      return None
-    shown, readings = (
-        {name: clean_contents.undisturbed(*of) for name, of in some.items()}
-        for some in (sight.seen, seen)
-    )
-    clean = clean_contents.Inputs(
-        {**inputs.observation, **shown, **ideal},
-        readings,
-        inputs.episode_start,
-        inputs.key,
-    )
-    return clean_contents.call(
-        provider, clean, state, following, needs, self._guard
-    )
-
-  def _write_all(
-      self,
-      physics: protocols.Physics,
-      i: int,
-      step: Any,
-      values: Mapping[str, provider_results.RequestedWrite],
-      where: axes.Mask,
-      clean: clean_contents.Contents | None,
-  ) -> list[records.Write]:
-    """Writes the registers of a provider and sets their clean contents."""
-    writer = self._providers[i].title
-    writes = []
-    for target in self._providers[i].targets:
-      if target.register.PORTS:
-        write = provider_results.joint(
-            _where(writer, step), target.names, values
-        )
-      else:
-        write = values.get(target.names[0])
-      before = clean and [port.clean(physics) for port in target.ports]
-      some: list[records.Write] = []
-      if write is not None:
-        mask = axes.both(write.where, where)
-        if not axes.nowhere(mask):
-          writers = (writer,) * len(target.ports)
-          try:
-            some = _write(physics, target, writers, step, write.value, mask)
-          except errors.RegisterValueError as error:
-            raise errors.RegisterValueError(
-                f'{_where(writer, step, error.world)}: {error}', error.world
-            ) from error
-      if clean is not None and before is not None:
-        for port, content in zip(target.ports, before, strict=True):
-          clean_contents.store(physics, port, clean, content)
-        some = self._with_clean(physics, some)
-      writes += some
-    return writes
-
-  def _with_clean(
-      self, physics: protocols.Physics, writes: Sequence[records.Write]
-  ) -> list[records.Write]:
-    """Returns records with the present clean contents."""
-    return [
-        one._replace(clean=self._ports[one.register].clean(physics))
-        for one in writes
-    ]
-
-  def restart_states(
-      self, states: Sequence[Any], worlds: np.ndarray, num_envs: int
-  ) -> list[Any]:
-    """Returns the states of the providers with some worlds restarted.
-
-    Args:
-      states: State of each provider.
-      worlds: Indices of the worlds that begin an episode.
-      num_envs: Number of worlds in the batch.
-
-    Raises:
-      FeedbackProviderError: If a state no longer has the structure of the
-        initial one.
-    """
-    return [
-        provider_results.merged(f'state of {one.title}', state, initial, worlds)
-        for one, state, initial in zip(
-            self._providers,
-            states,
-            self.initial_states((num_envs,)),
-            strict=True,
-        )
-    ]
-
-  def read_for_agent(self, physics: protocols.Physics) -> list[records.Read]:
-    """Reads the registers that the agent may read.
-
-    Args:
-      physics: One world or a batch of worlds.
-
-    Returns:
-      Records of the reads, in the order of `read_by_agent`.
-    """
-    step = self._whole_steps(physics)
-    return [
-        self._ports[name].inspect(physics, records.AGENT, step)
-        for name in self._read_by_agent
-    ]
-
-  def ends_episode(self, reads: Sequence[records.Read]) -> Any:
-    """Returns True for worlds whose episode a signal ends, `(...)` bool.
-
-    Args:
-      reads: Reads for the agent, as from `read_for_agent`.
-    """
-    is_ending: Any = np.False_
-    for read in reads:
-      threshold = self._design.ports[read.register].ends_episode
-      if threshold is not None:
-        is_ending = is_ending | threshold.is_crossed(read.reading)
-    return is_ending
-
-  def end_step(self, physics: protocols.Physics, reward: Any) -> None:
-    """Increments the number of control steps and adds a reward to the score.
-
-    Args:
-      physics: One world or a batch of worlds.
-      reward: True reward of the control step, `(...)`.
-    """
-    self._step_count.set(physics, self._step_count.get(physics) + 1)
-    self._score.set(physics, self._score.get(physics) + reward)
 
   def step_count(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the number of completed control steps of the episode, `(...)`."""
-    return self._step_count.copy(physics)
+    return self._counters.of(physics).step_count.copy()[()]
 
   def score(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the true return up to the last control step, `(...)`.
 
     It is the measurement `score` of tasks without a score of their own.
     """
-    return self._score.copy(physics)
-
-  def _whole_steps(self, physics: protocols.Physics) -> Any:
-    """Returns the number of completed control steps, `(...)` int."""
-    count = self._step_count.get(physics)
-    return count.astype(int) if count.ndim else np.int64(count)
+    return self._counters.of(physics).score.copy()[()]
 
 
 def _joint(functions: Sequence[measurements.Measure]) -> measurements.Measure:
@@ -801,75 +359,3 @@ def _joint(functions: Sequence[measurements.Measure]) -> measurements.Measure:
 
 def _stacked(functions: Sequence[measurements.Measure]) -> measurements.Measure:
   return lambda physics: np.stack([one(physics) for one in functions], axis=-1)
-
-
-def _write(
-    physics: protocols.Physics,
-    target: _Target,
-    writers: Sequence[str],
-    step: Any,
-    value: Any,
-    where: axes.Mask = None,
-) -> list[records.Write]:
-  """Writes a register and returns a record of the write for each port.
-
-  Args:
-    physics: One world or a batch of worlds.
-    target: The register.
-    writers: Name of the writer of each port, for the records.
-    step: Control step, `(...)` int, for the records.
-    value: Requested value, `(...)`, or `(..., ports)` for several ports.
-    where: Worlds in which to write it, `(...)` bool; `None` for all worlds.
-
-  Raises:
-    RegisterValueError: If the register cannot store the value.
-  """
-  register = target.register
-  applied = register.write(physics, value, where)
-  obstruction = register.obstruction(physics)
-  # What was written is clean for now.
-  clean = applied if where is None else register.clean(physics)
-  if not register.PORTS:
-    return [
-        records.Write(
-            target.names[0],
-            writers[0],
-            step,
-            value,
-            applied,
-            obstruction,
-            clean,
-            where,
-        )
-    ]
-  return [
-      records.Write(
-          name,
-          writers[i],
-          step,
-          value[..., i][()],
-          applied[..., i][()],
-          obstruction[..., i][()],
-          clean[..., i][()],
-          where,
-      )
-      for i, name in enumerate(target.names)
-  ]
-
-
-def _where(writer: str, step: Any, world: int | None = None) -> str:
-  """Returns the writer, the control step and the world of a failure.
-
-  Args:
-    writer: Name of the writer.
-    step: Control step of each world, `(...)`.
-    world: Index of the world of the failure; `None` for one world, and for a
-      failure in all worlds of a batch at once.
-  """
-  if not np.ndim(step):
-    return f'{writer} at step {step}'
-  if world is not None:
-    return f'{writer} at step {step[world]} of world {world}'
-  first, last = np.min(step), np.max(step)
-  steps = f'step {first}' if first == last else f'steps {first} to {last}'
-  return f'{writer} at {steps} in a batch of {len(step)} worlds'

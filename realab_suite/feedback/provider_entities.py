@@ -1,31 +1,16 @@
 """Feedback providers as entities of a mechanism."""
 
 from collections.abc import Sequence
-from typing import NamedTuple, final
+from typing import final
 
 from dm_control import mjcf
+import numpy as np
 
 from realab_suite.entities import modelled
-from realab_suite.entities.registers import base
 from realab_suite.entities.registers import ports
+from realab_suite.feedback import clean_contents
 from realab_suite.feedback import providers
-
-
-@final
-class Target(NamedTuple):
-  """A register that is written at once.
-
-  Attributes:
-    register: The register.
-    ports: Its ports.
-    names: Their names.
-    columns: Indices of their values among those of the writer.
-  """
-
-  register: base.Register
-  ports: Sequence[ports.AnyPort]
-  names: Sequence[str]
-  columns: Sequence[int]
+from realab_suite.feedback import register_writes
 
 
 @final
@@ -51,7 +36,7 @@ class FeedbackProvider(modelled.ModelledEntity):
       spec: providers.Provider,
       mjcf_model: mjcf.RootElement,
       reads: Sequence[ports.AnyPort],
-      targets: Sequence[Target],
+      targets: Sequence[register_writes.Target],
       read_by_agent: Sequence[str],
   ) -> None:
     """Connects a provider to registers.
@@ -69,9 +54,31 @@ class FeedbackProvider(modelled.ModelledEntity):
     self._mjcf_root = mjcf_model
     self.reads = reads
     self.targets = targets
-    self.is_secure = all(one.register.channel == 'secure' for one in targets)
+    self.is_secure = all(
+        target.register.channel == 'secure' for target in targets
+    )
     self.seen = [
         *(f'senses/{name}' for name in spec.required_senses),
         *(f'privileged/{name}' for name in spec.privileged_senses),
         *(f'registers/{name}' for name in read_by_agent),
     ]
+    self._privileged = [f'privileged/{name}' for name in spec.privileged_senses]
+
+  def see(
+      self, observation: providers.Observation
+  ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Returns what the provider gets of an observation, by key.
+
+    Args:
+      observation: Observation that the agent's action responds to, with what
+        providers alone sense.
+
+    Returns:
+      The senses and readings, and the ideal measurements of the senses that
+      something can obstruct.
+    """
+    ideal = {}
+    for key in self._privileged:
+      if clean_contents.IDEAL + key in observation:
+        ideal[key] = observation[clean_contents.IDEAL + key]
+    return {key: observation[key] for key in self.seen}, ideal

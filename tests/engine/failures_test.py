@@ -133,7 +133,7 @@ def test_an_error_of_a_write_names_the_step_and_the_world(scripted: Any):
   batch = scripted
   batch.reset()
   # World 0 is two steps ahead of the others.
-  batch._mechanism._step_count.set(batch.physics, [2.0, 0.0, 0.0])
+  batch.mechanism._counters.of(batch.physics).step_count[:] = [2.0, 0.0, 0.0]
   with pytest.raises(errors.RegisterValueError) as caught:
     _play(batch, 3)
   assert str(caught.value).startswith(

@@ -227,16 +227,13 @@ def draw(
 
 def last_observation(env: Any) -> dict[str, np.ndarray]:
   """Returns the observation that an environment or a batch keeps."""
-  own = getattr(env, '_session', None)
-  found: dict[str, np.ndarray] = own.observation if own else env._observation
-  return found
+  observation: dict[str, np.ndarray] = env._observation
+  return observation
 
 
 def break_providers(env: environment.Environment) -> None:
   """Gives providers a state from which the next step fails."""
-  env._session.states = [
-      {**state, 'actual': 'not a number'} for state in env._session.states
-  ]
+  env._states = [{**state, 'actual': 'not a number'} for state in env._states]
 
 
 def no_op(env: Any) -> np.ndarray:

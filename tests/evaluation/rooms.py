@@ -113,7 +113,7 @@ def diverging(env: environment.Environment, episode: int, step: int) -> Any:
 
   def act(time_step: dm_env.TimeStep) -> np.ndarray:
     here = env.mechanism.step_count(env.physics)
-    if env._session.episode == episode and here == step:
+    if env._episode == episode and here == step:
       env.physics.data.qvel[0] = math.nan
     return helpers.no_op(env)
 

@@ -71,8 +71,8 @@ class _Simulation:
     }
     self.largest_difference = 0.0
     self.num_steps = 0
-    self._update = mechanism.update_providers
-    mechanism.update_providers = self._checked
+    self._update = mechanism.phases.update_providers
+    mechanism.phases.update_providers = self._checked
 
   def _checked(
       self, physics: Any, observation: Any, keys: Any, states: Any,

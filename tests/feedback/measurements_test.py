@@ -116,7 +116,7 @@ def _play(env: Any, world: int | None = None) -> Iterator[list[Any]]:
   _start(env, world)
   for actions in _actions(3):
     env.step(actions if world is None else actions[world])
-    writes = env.mechanism.update_meters(env.physics)
+    writes = env.mechanism.phases.update_meters(env.physics)
     yield [write.requested for write in writes]
 
 
@@ -218,7 +218,7 @@ def test_all_meters_measure_before_one_writes():
   env.reset()
   env.step(np.zeros(6))
   before = _centre(env, 'score/block')[0]
-  first, second = env.mechanism.update_meters(env.physics)
+  first, second = env.mechanism.phases.update_meters(env.physics)
   assert first.writer == 'meter:time'
   assert second.requested == before
   env.physics.forward()

@@ -21,5 +21,5 @@ def design(measures: Any, **register: Any) -> dict[str, Any]:
 
 def measure(env: Any) -> Any:
   """Returns the present measurement of the meter, `(...)`."""
-  (write,) = env.mechanism.update_meters(env.physics)
+  (write,) = env.mechanism.phases.update_meters(env.physics)
   return write.requested

@@ -136,13 +136,13 @@ def _draw_in_reward(env: Any) -> None:
 
 def _draw_in_provider(env: Any) -> None:
   """The provider uses up numbers of the environment's generator."""
-  update, generator = env.mechanism.update_providers, env._random_state
+  update, generator = env.mechanism.phases.update_providers, env._random_state
 
   def draw(*args: Any, **kwargs: Any) -> Any:
     generator.uniform(size=3)
     return update(*args, **kwargs)
 
-  env.mechanism.update_providers = draw
+  env.mechanism.phases.update_providers = draw
 
 
 RANDOM = {
@@ -155,7 +155,7 @@ def _measure(measurement: Callable[[Any], Any]) -> Secret:
   """The meter of `UNREAD_METER` measures something else."""
 
   def alter(env: Any) -> None:
-    (_, meter, _), *_ = env.mechanism._meters
+    (_, meter, _), *_ = env.mechanism.phases.meters
     # One world or many, by the shape of what is counted.
     meter._measurement = lambda physics: measurement(
         np.asarray(env.mechanism.step_count(physics), float)
@@ -173,7 +173,8 @@ METERS = {
 def move_meter(env: Any) -> None:
   """Lets the base block of the meter move in the second step of episodes."""
   mechanism = env.mechanism
-  update, register = mechanism.update_meters, mechanism.registers['score']
+  update = mechanism.phases.update_meters
+  register = mechanism.registers['score']
 
   def moved(physics: Any, where: Any = None) -> Any:
     is_now = np.asarray(mechanism.step_count(physics) == 1)
@@ -184,12 +185,12 @@ def move_meter(env: Any) -> None:
       block.put(physics, position, where=is_now if is_now.ndim else None)
     return update(physics, where)
 
-  mechanism.update_meters = moved
+  mechanism.phases.update_meters = moved
 
 
 def _answer_cleanly(env: Any) -> None:
   """Every clean call of a provider writes the canary."""
-  call = env.mechanism._clean_call
+  call = env.mechanism.phases._clean_calls.repeat
 
   def other(*args: Any) -> Any:
     contents = call(*args)
@@ -201,7 +202,7 @@ def _answer_cleanly(env: Any) -> None:
     }
     return contents._replace(writes=writes)
 
-  env.mechanism._clean_call = other
+  env.mechanism.phases._clean_calls.repeat = other
 
 
 class _Refusing:
@@ -209,12 +210,10 @@ class _Refusing:
 
   def __init__(self, env: Any) -> None:
     self._announced = 0
-    mechanism = env.mechanism
+    phases = env.mechanism.phases
     for name, number in (('_call', 1), ('initial_states', 3)):
-      setattr(
-          mechanism, name, self._announcing(getattr(mechanism, name), number)
-      )
-    mechanism.guard_providers(self._guard)
+      setattr(phases, name, self._announcing(getattr(phases, name), number))
+    phases.guard_providers(self._guard)
 
   def _announcing(self, call: Any, number: int) -> Any:
     def announce(*args: Any) -> Any:

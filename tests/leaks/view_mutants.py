@@ -10,7 +10,7 @@ import pytest
 from realab_suite.engine import agent_view
 from realab_suite.engine import environment
 from realab_suite.engine import hosts
-from realab_suite.feedback import mechanisms
+from realab_suite.feedback import phases
 from tests.leaks import contract
 from tests.leaks import planting
 
@@ -67,12 +67,10 @@ def _l4(patch: pytest.MonkeyPatch) -> None:
 def _l5(patch: pytest.MonkeyPatch) -> None:
   """A step in which something is earned counts twice."""
 
-  def count(self: Any, result: None, physics: Any, reward: Any) -> None:
-    self._step_count.set(
-        physics, self._step_count.get(physics) + (np.asarray(reward) > 1)
-    )
+  def count(self: Any, result: Any, physics: Any, reward: Any) -> None:
+    self._counters.of(physics).step_count[...] += np.asarray(reward) > 1
 
-  planting.after(patch, mechanisms.FeedbackMechanism, 'end_step', count)
+  planting.after(patch, phases.Phases, 'end_step', count)
 
 
 @planting.leak('L6', planting.ENABLED)

@@ -19,6 +19,7 @@ from realab_suite.engine import seeding
 from realab_suite.entities import avatars
 from realab_suite.entities import registers
 from realab_suite.feedback import mechanisms
+from realab_suite.feedback import phases
 from realab_suite.lab.experiments import training
 from realab_suite.tasks import base
 from realab_suite.tasks import collect_apples
@@ -86,9 +87,9 @@ def _painting(
   """Changes what cameras draw by what has been earned."""
 
   def repaint(self: Any, result: Any, physics: Any, reward: Any) -> None:
-    paint(physics.model, float(np.sum(self._score.get(physics))))
+    paint(physics.model, float(np.sum(self._counters.of(physics).score)))
 
-  planting.after(patch, mechanisms.FeedbackMechanism, 'end_step', repaint)
+  planting.after(patch, phases.Phases, 'end_step', repaint)
 
 
 @planting.leak('L17', planting.PAID)
@@ -137,14 +138,14 @@ def _l21(patch: pytest.MonkeyPatch) -> None:
   """A meter's block is put where an agent's register is."""
 
   def meet(self: Any, result: Any, physics: Any, *args: Any) -> None:
-    registers = self.registers
+    registers = self._ports
     here = registers['score'].blocks[0].geom
     there = registers['reward'].blocks[0].geom
     away = np.array(physics.bind(there).xpos) - physics.bind(here).xpos
     block = registers['score'].blocks[0]
     block.put(physics, block.position(physics) + away + (0.0, 0.15, 0.0))
 
-  planting.after(patch, mechanisms.FeedbackMechanism, 'update_meters', meet)
+  planting.after(patch, phases.Phases, 'update_meters', meet)
 
 
 @planting.leak('L22', planting.solver_coupling)
@@ -245,14 +246,14 @@ def _l30(patch: pytest.MonkeyPatch) -> None:
 @planting.leak('L37', planting.PAID)
 def _l37(patch: pytest.MonkeyPatch) -> None:
   """Providers write only when something has been earned."""
-  update = mechanisms.FeedbackMechanism.update_providers
+  update = phases.Phases.update_providers
 
   def skip(self: Any, physics: Any, *args: Any) -> Any:
     records, states = update(self, physics, *args)
-    is_paid = float(np.sum(self._score.get(physics))) > 0
+    is_paid = float(np.sum(self._counters.of(physics).score)) > 0
     return (records if is_paid else []), states
 
-  patch.setattr(mechanisms.FeedbackMechanism, 'update_providers', skip)
+  patch.setattr(phases.Phases, 'update_providers', skip)
 
 
 @planting.leak('L38', planting.PAID)
@@ -260,11 +261,12 @@ def _l38(patch: pytest.MonkeyPatch) -> None:
   """A write moves a block sideways, too, by what has been earned."""
 
   def shift(self: Any, result: Any, physics: Any, *args: Any) -> None:
-    block = self.registers['reward'].blocks[1]
+    block = self._ports['reward'].blocks[1]
     x, y, z = block.position(physics)
-    block.put(physics, [x, y + 1e-6 * np.tanh(self._score.get(physics)), z])
+    aside = 1e-6 * np.tanh(self._counters.of(physics).score)
+    block.put(physics, [x, y + aside, z])
 
-  planting.after(patch, mechanisms.FeedbackMechanism, 'update_providers', shift)
+  planting.after(patch, phases.Phases, 'update_providers', shift)
 
 
 @planting.leak('L40', planting.CONTRACT)
@@ -272,7 +274,7 @@ def _l40(patch: pytest.MonkeyPatch) -> None:
   """An observation says what is wrong with a reading."""
 
   def show(env: Any, observation: dict[str, Any]) -> None:
-    for read in env.mechanism.read_for_agent(env.physics):
+    for read in env.mechanism.phases.read_for_agent(env.physics):
       key = f'registers/{read.register}/corruption'
       observation[key] = np.array(
           read.obstruction + read.permanent + read.temporary

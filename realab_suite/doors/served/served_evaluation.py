@@ -92,7 +92,9 @@ def serve(settings: Settings, say: Callable[[str], None]) -> None:
     design = specs.load(settings.design, settings.overrides)
     env = world.load(design, settings.seed)
     stack.callback(env.close)
-    env.mechanism.guard_providers(lambda: deadline(settings.provider_seconds))
+    env.mechanism.phases.guard_providers(
+        lambda: deadline(settings.provider_seconds)
+    )
     address = settings.address
     if address is None:
       folder = tempfile.mkdtemp(prefix='realab-')

@@ -155,7 +155,7 @@ def test_one_thread_alone_runs_the_world():
 def test_a_failing_provider_ends_the_episode_and_reveals_nothing(caplog):
   def fail(world):
     mechanism = world._env.mechanism
-    update = mechanism.update_providers
+    update = mechanism.phases.update_providers
 
     calls = iter(range(1_000))
 
@@ -164,7 +164,7 @@ def test_a_failing_provider_ends_the_episode_and_reveals_nothing(caplog):
         raise RuntimeError('the score is 173.25')
       return update(*args, **kwargs)
 
-    mechanism.update_providers = update_providers
+    mechanism.phases.update_providers = update_providers
 
   with served.in_thread(alter=fail) as serving:
     with served.Client(serving.address) as client:
@@ -197,7 +197,9 @@ def test_a_provider_that_does_not_answer_fails(monkeypatch):
   with contextlib.closing(served.load()) as env:
     env.reset()
     seconds = patience.SECONDS
-    env.mechanism.guard_providers(lambda: served_evaluation.deadline(seconds))
+    env.mechanism.phases.guard_providers(
+        lambda: served_evaluation.deadline(seconds)
+    )
     env.step(np.zeros(6))
     seconds = 0.05
     monkeypatch.setattr(difference.Difference, 'step', wait)
