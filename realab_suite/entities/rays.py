@@ -180,8 +180,8 @@ class RaySense(modelled.ModelledEntity):
     cos, sin = matrix[..., 0:1], matrix[..., 3:4]
     x, y = self._fan
     directions = np.zeros((*cos.shape[:-1], len(x), 3))
-    directions[..., 0] = cos * x - sin * y
-    directions[..., 1] = sin * x + cos * y
+    np.subtract(cos * x, sin * y, out=directions[..., 0])
+    np.add(sin * x, cos * y, out=directions[..., 1])
     distances, geoms = cast(physics, frame.xpos, directions, self._carrier)
     missed = (geoms < 0) | (distances > self._max_distance)
     classes = self._class_of_geom[geoms]

@@ -382,9 +382,10 @@ class Phases:
       Number of completed control steps of the episode, `(...)`.
     """
     counters = self._counters.of(physics)
-    counters.step_count += 1
-    counters.score += reward
-    return counters.step_count.copy()[()]
+    num_steps = counters.step_count[()] + 1
+    counters.step_count[...] = num_steps
+    counters.score[...] = counters.score[()] + reward
+    return num_steps
 
   def read_for_agent(self, physics: protocols.Physics) -> list[records.Read]:
     """Reads the registers that the agent may read.
