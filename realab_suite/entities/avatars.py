@@ -275,7 +275,10 @@ class Avatar(measurables.MeasurableEntity):
     senses: dict[str, np.ndarray] = {}
     if 'ray_distances' in names or 'ray_classes' in names:
       distances, classes = self._rays.sense(physics)
-      senses |= {'ray_distances': distances, 'ray_classes': classes}
+      if 'ray_distances' in names:
+        senses['ray_distances'] = distances
+      if 'ray_classes' in names:
+        senses['ray_classes'] = classes
     parts = [name for name in PROPRIOCEPTION if name in names]
     if parts:
       body = self.proprioception(physics).astype(np.float32)
@@ -283,7 +286,7 @@ class Avatar(measurables.MeasurableEntity):
         senses[name] = body[..., PROPRIOCEPTION[name]]
     if 'camera' in names:
       senses['camera'] = cameras.render(physics, self._camera, *camera_size)
-    return {name: value for name, value in senses.items() if name in names}
+    return senses
 
   def make_graspable(self, blocks: Sequence[block_kinds.Block]) -> None:
     """Makes blocks graspable by the hand.

@@ -57,11 +57,6 @@ def both(one: Mask, other: Mask) -> Mask:
   return None if mask is None or everywhere(mask) else mask
 
 
-def nowhere(mask: Mask) -> bool:
-  """Returns True if a mask is false in all worlds."""
-  return mask is not None and not anywhere(mask)
-
-
 def merge(where: Mask, new: Any, old: Any) -> Any:
   """Returns `new` where a mask is true, and `old` elsewhere.
 

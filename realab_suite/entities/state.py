@@ -131,12 +131,7 @@ class Slots:
   """Several slots of an entity, whose arrays one call returns."""
 
   def __init__(self, mjcf_model: mjcf.RootElement, **sizes: int | None) -> None:
-    """Claims the slots.
-
-    Args:
-      mjcf_model: Model of the entity that owns the slots.
-      **sizes: Size of each slot, by name; see `Slot`.
-    """
+    """Claims slots, given the size of each by name; see `Slot`."""
     self._slots = {
         name: Slot(mjcf_model, name, size) for name, size in sizes.items()
     }
@@ -144,16 +139,9 @@ class Slots:
     self._arrays = types.SimpleNamespace()
 
   def of(self, physics: protocols.Physics) -> types.SimpleNamespace:
-    """Returns the live array of each slot, an attribute of its name.
+    """Returns the live array of each slot, as an attribute of its name.
 
-    Shapes are `(..., size)` or `(...)` for a scalar. Index an array with `()`
-    to get the value of a scalar in one world as a number.
-
-    Args:
-      physics: One world or a batch of worlds.
-
-    Raises:
-      StateLayoutError: If the slots are not in the compiled model.
+    Index the array of a scalar with `()` to get a number in one world.
     """
     if physics.data is not self._data:
       arrays = {name: slot.array(physics) for name, slot in self._slots.items()}

@@ -290,13 +290,8 @@ def _contents(
   If an input is unknown or the call fails, the contents are nan: they are
   unknown, too, and an exception would tell the agent something about them.
 
-  Args:
-    provider: The provider.
-    inputs: Arguments with clean contents in place of readings.
-    state: State of the provider before the step.
-    without: State after the step without this call; see `following`.
-    where: Worlds in which to call it, `(...)` bool, at least one.
-    guard: Context manager of the call.
+  The state is that before the step, and `without` that after it without this
+  call; see `following`.
   """
   if not np.ndim(where):
     writes, clean, is_known = _call(provider, inputs, state[CLEAN], guard)

@@ -55,29 +55,26 @@ def write(
   obstruction = register.obstruction(physics)
   # What was written is clean for now.
   clean = applied if where is None else register.clean(physics)
+  record = records.Write(
+      target.names[0],
+      writers[0],
+      step,
+      value,
+      applied,
+      obstruction,
+      clean,
+      where,
+  )
   if not register.PORTS:
-    return [
-        records.Write(
-            target.names[0],
-            writers[0],
-            step,
-            value,
-            applied,
-            obstruction,
-            clean,
-            where,
-        )
-    ]
+    return [record]
   return [
-      records.Write(
-          name,
-          writers[i],
-          step,
-          value[..., i][()],
-          applied[..., i][()],
-          obstruction[..., i][()],
-          clean[..., i][()],
-          where,
+      record._replace(
+          register=name,
+          writer=writers[i],
+          requested=value[..., i][()],
+          applied=applied[..., i][()],
+          obstruction=obstruction[..., i][()],
+          clean=clean[..., i][()],
       )
       for i, name in enumerate(target.names)
   ]

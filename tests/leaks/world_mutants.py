@@ -297,7 +297,7 @@ def _l41(patch: pytest.MonkeyPatch) -> None:
     if earned.pop(id(self), 0.0) > 0:
       raise composer.EpisodeInitializationError('once more')
 
-  planting.after(patch, environment.Environment, '_control_step', note)
+  planting.after(patch, environment.Environment, 'step', note)
   patch.setattr(collect_apples.CollectApples, 'initialize_episode', try_again)
 
 

@@ -9,7 +9,6 @@ from realab_suite.entities import axes
 from realab_suite.entities import block_kinds
 from realab_suite.entities import protocols
 from realab_suite.entities.registers import base
-from realab_suite.entities.registers import moves
 
 # Largest heading that represents a value, in rad. Headings are equal modulo a
 # full turn. The range ends before half a turn, so that a small push at either
@@ -59,7 +58,7 @@ class BlockOrientationRegister(base.Register):
       value: np.ndarray,
       where: axes.Mask = None,
   ) -> np.ndarray:
-    moves.turn(physics, self._block, value * self._scale, where)
+    self._block.turn(physics, value * self._scale, where)
     return value
 
   def _read_blocks(self, physics: protocols.Physics) -> np.ndarray:

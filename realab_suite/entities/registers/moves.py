@@ -50,20 +50,3 @@ def undisturbed(
   position[..., 0] += along
   position[..., 2] = height
   return position
-
-
-def turn(
-    physics: protocols.Physics,
-    block: block_kinds.Block,
-    heading: np.ndarray,
-    where: axes.Mask,
-) -> None:
-  """Sets the heading of a block. Nothing obstructs a turn.
-
-  Args:
-    physics: One world or a batch of worlds.
-    block: The block.
-    heading: Angle about the vertical, `(...)`, in rad.
-    where: As in `slide`.
-  """
-  block.turn(physics, heading, where)
