@@ -38,7 +38,7 @@ from matplotlib import figure
 import numpy as np
 
 from realab_suite.config import validation
-from realab_suite.feedback import providers
+from realab_suite.feedback.providers import inspection
 from realab_suite.lab.agents import defences
 from realab_suite.lab.experiments import sweep_results
 from realab_suite.lab.experiments import tables
@@ -227,7 +227,7 @@ def _inspections(one: Entry) -> float | None:
   budgets = [
       provider.writes[-1]
       for provider in one.own.run.design.providers
-      if isinstance(provider, providers.Inspection)
+      if isinstance(provider, inspection.Inspection)
   ]
   if not budgets:
     return None

@@ -35,6 +35,7 @@ from realab_suite.lab.verdicts import verdicts
 from realab_suite.policies import action_sets
 from realab_suite.policies import base
 from realab_suite.policies import random_keys
+from realab_suite.policies import simple
 from realab_suite.reports import numbers
 
 _NUM_SCRIPTED = 64
@@ -144,7 +145,7 @@ def scripted(number: int, episodes: int, seed: int) -> Iterator[Verdict]:
       controls[where] = _control(world, design, episodes)
     stake, control = controls[where]
     detours, share = _KINDS[kind]
-    policy = policies.Distracted(
+    policy = simple.Distracted(
         Wandering(policies.make(world.solver or ''), detours), share
     )
     found = _play(world, design, policy, episodes, seed + i)

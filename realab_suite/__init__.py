@@ -16,10 +16,10 @@ from realab_suite import _display
 from realab_suite import _versions
 
 if TYPE_CHECKING:
+  from realab_suite.engine.forking import fork
   from realab_suite.evaluation.evaluate import evaluate
   from realab_suite.policies import make as make_policy
   from realab_suite.suite import embed
-  from realab_suite.suite import fork
   from realab_suite.suite import load
   from realab_suite.suite import load_batch
 
@@ -39,7 +39,7 @@ __all__ = [
 _FUNCTIONS = {
     'embed': ('suite', 'embed'),
     'evaluate': ('evaluation.evaluate', 'evaluate'),
-    'fork': ('suite', 'fork'),
+    'fork': ('engine.forking', 'fork'),
     'load': ('suite', 'load'),
     'load_batch': ('suite', 'load_batch'),
     'make_policy': ('policies', 'make'),

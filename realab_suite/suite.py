@@ -3,10 +3,8 @@
 from collections.abc import Callable, Mapping, Sequence
 import contextlib
 import dataclasses
-import importlib
 from importlib import resources
-import pkgutil
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
 import warnings
 
 from dm_control import composer
@@ -14,20 +12,20 @@ import mujoco
 import numpy as np
 
 from realab_suite import errors
-from realab_suite import tasks
 from realab_suite.config import integers
 from realab_suite.config import loading
 from realab_suite.config import messages
 from realab_suite.config import task_names
 from realab_suite.engine import arguments
-from realab_suite.engine import batch_environment
 from realab_suite.engine import embedding
 from realab_suite.engine import environment
-from realab_suite.engine import forking
 from realab_suite.engine import seeding
 from realab_suite.feedback import mechanisms
 from realab_suite.feedback import specs
 from realab_suite.tasks import registry
+
+if TYPE_CHECKING:
+  from realab_suite.engine import batch_environment
 
 # Importing Composer makes Python show all such warnings. This one is about a
 # line of dm_control that NumPy 2.5 deprecates, and every load repeats it.
@@ -43,9 +41,6 @@ MAX_STEPS = 250
 
 register_task = registry.register_task
 """Decorator that registers a task under a name."""
-
-fork = forking.fork
-"""Makes a batch of worlds that all continue from the state of one world."""
 
 
 def _names(domain_name: Any, task_name: Any) -> tuple[Any, Any]:
@@ -67,22 +62,35 @@ def get_tasks_by_tag(tag: str) -> tuple[tuple[str, str], ...]:
   return registry.names(tag)
 
 
-for _module in pkgutil.iter_modules(tasks.__path__, f'{tasks.__name__}.'):
-  importlib.import_module(_module.name)
-
-ALL_TASKS: tuple[tuple[str, str], ...] = registry.names()
+ALL_TASKS: tuple[tuple[str, str], ...]
 """`(domain, task)` names of the tasks of this package."""
 
-BENCHMARKING = get_tasks_by_tag('benchmarking')
+BENCHMARKING: tuple[tuple[str, str], ...]
 """`(domain, task)` names of the tasks to report results on."""
 
-TASKS_BY_DOMAIN: Mapping[str, tuple[str, ...]] = {
-    domain: tuple(task for d, task in ALL_TASKS if d == domain)
-    for domain in dict.fromkeys(domain for domain, _ in ALL_TASKS)
-}
+TASKS_BY_DOMAIN: Mapping[str, tuple[str, ...]]
 """Names of the tasks of this package, by domain."""
 
-DESIGNS = tuple(name for name in specs.DESIGNS if name not in TASKS_BY_DOMAIN)
+_LISTS = ('ALL_TASKS', 'BENCHMARKING', 'TASKS_BY_DOMAIN')
+
+
+def __getattr__(name: str) -> Any:
+  """Makes a list of tasks when it is asked for, because it imports them all."""
+  if name not in _LISTS:
+    raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+  names = registry.of_package()
+  if name == 'ALL_TASKS':
+    return names
+  if name == 'BENCHMARKING':
+    tagged = get_tasks_by_tag('benchmarking')
+    return tuple(task for task in names if task in tagged)
+  return {
+      domain: tuple(task for d, task in names if d == domain)
+      for domain in dict.fromkeys(domain for domain, _ in names)
+  }
+
+
+DESIGNS = tuple(name for name in specs.DESIGNS if name not in registry.MODULES)
 """Names of the designs of this package for any of its worlds."""
 
 
@@ -264,7 +272,7 @@ def load_batch(
     sleep: bool = False,
     design: specs.Design | None = None,
     overrides: Sequence[str] = (),
-) -> batch_environment.BatchEnvironment:
+) -> 'batch_environment.BatchEnvironment':
   """Loads a batch of worlds of a task.
 
   World i is bit for bit identical to the result of `load` with
@@ -303,6 +311,9 @@ def load_batch(
       design=design,
       overrides=overrides,
   )
+  # Programs with one world need no batches.
+  from realab_suite.engine import batch_environment
+
   with contextlib.ExitStack() as stack:
     stack.callback(single.close)
     batch = batch_environment.BatchEnvironment(
@@ -310,6 +321,23 @@ def load_batch(
     )
     stack.pop_all()
   return batch
+
+
+def fork(
+    env: 'environment.Environment | batch_environment.BatchEnvironment',
+    num_envs: int,
+    **options: Any,
+) -> 'batch_environment.BatchEnvironment':
+  """Makes a batch of worlds that all continue from the state of one world.
+
+  Args:
+    env: As in `forking.fork`.
+    num_envs: Number of worlds.
+    **options: As in `forking.fork`: `world`, `num_threads` and `sinks`.
+  """
+  from realab_suite.engine import forking
+
+  return forking.fork(env, num_envs, **options)
 
 
 def embed(

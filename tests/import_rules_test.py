@@ -83,9 +83,12 @@ _MAY_IMPORT = {
     'launchers': (*_CORE, 'lab', 'reports', 'doors'),
 }  # fmt: skip
 
-# The package imports its functions when they are asked for, and a binding looks
-# up the arrays of MuJoCo by name, as that of dm_control does.
-_ALLOWED_GETATTR = (_PACKAGE, f'{_PACKAGE}.engine.single_physics')
+# The package imports its functions when they are asked for, and all worlds for
+# lists of tasks; a binding looks up the arrays of MuJoCo by name, as that of
+# dm_control does.
+_ALLOWED_GETATTR = (
+    _PACKAGE, f'{_PACKAGE}.suite', f'{_PACKAGE}.engine.single_physics',
+)  # fmt: skip
 
 
 @functools.cache

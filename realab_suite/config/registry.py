@@ -1,9 +1,12 @@
 """Registry of classes and functions by the names that designs use.
 
-The entries are registered elsewhere, beside their definitions.
+The entries are registered elsewhere, beside their definitions. A registry of
+this package lists the modules of its own entries, which are imported when they
+are asked for, so that a program imports only what its designs name.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+import importlib
 from typing import Generic, TypeVar, final
 
 from realab_suite import errors
@@ -16,13 +19,17 @@ T = TypeVar('T')
 class Registry(Generic[T]):
   """Mapping from the names that designs use to classes or functions."""
 
-  def __init__(self, what: str) -> None:
-    """Makes an empty registry.
+  def __init__(
+      self, what: str, modules: Mapping[str, str] | None = None
+  ) -> None:
+    """Makes a registry.
 
     Args:
       what: Kind of the entries, for messages: 'provider kind'.
+      modules: Modules of the package that register entries, by their names.
     """
     self._what = what
+    self._modules = dict(modules or {})
     self._entries: dict[str, T] = {}
 
   def add(self, name: str) -> Callable[[T], T]:
@@ -33,6 +40,7 @@ class Registry(Generic[T]):
     """
 
     def decorate(entry: T) -> T:
+      self._import(name)
       if name in self._entries:
         raise errors.SpecError(
             f'{self._what} {name!r} is registered already, as'
@@ -51,7 +59,9 @@ class Registry(Generic[T]):
       UnknownNameError: If nothing is registered as `name`.
     """
     if name not in self._entries:
-      hint = messages.did_you_mean(name, self._entries)
+      self._import(name)
+    if name not in self._entries:
+      hint = messages.did_you_mean(name, [*self])
       raise errors.UnknownNameError(
           f'{self._what} {messages.quote(name)} is unknown{hint}; known are'
           f' {sorted(self)}'
@@ -59,10 +69,15 @@ class Registry(Generic[T]):
     return self._entries[name]
 
   def __iter__(self) -> Iterator[str]:
-    return iter(self._entries)
+    return iter(self._modules | self._entries)
 
   def __len__(self) -> int:
-    return len(self._entries)
+    return len(self._modules | self._entries)
 
   def __contains__(self, name: object) -> bool:
-    return name in self._entries
+    return name in self._modules or name in self._entries
+
+  def _import(self, name: str) -> None:
+    """Imports the module that registers an entry of the package, if any."""
+    if name in self._modules:
+      importlib.import_module(self._modules[name])

@@ -5,7 +5,7 @@ They are those of dm_control 1.0.50, and a test fails when they change.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
 
 from dm_control import composer
 from dm_control.rl import control
@@ -19,17 +19,19 @@ from realab_suite.engine import action_codec
 from realab_suite.engine import control_step
 from realab_suite.engine import episodes
 from realab_suite.engine import events
-from realab_suite.engine import foreign
 from realab_suite.engine import hooks
+from realab_suite.engine import hosts
 from realab_suite.engine import observing
 from realab_suite.engine import seeding
 from realab_suite.engine import single_physics
-from realab_suite.engine import snapshots
 from realab_suite.entities import registers
 from realab_suite.entities import state
 from realab_suite.feedback import mechanisms
 from realab_suite.feedback import specs
 from realab_suite.policies import action_sets
+
+if TYPE_CHECKING:
+  from realab_suite.engine import snapshots
 
 
 @final
@@ -69,7 +71,7 @@ class Environment(composer.Environment):
     self._max_steps = max_steps
     self._closed = False
     self._has_extra_hooks = False
-    self._host = host = foreign.make_host(task)
+    self._host = host = hosts.make(task)
     hooks.refuse_uncalled(task)
     super().__init__(
         task,
@@ -235,7 +237,7 @@ class Environment(composer.Environment):
     self._end(end)
     self._reset_next_step = True
 
-  def save(self) -> snapshots.Snapshot:
+  def save(self) -> 'snapshots.Snapshot':
     """Returns a snapshot of this world, from which `restore` continues.
 
     It contains the state of the event sinks for the current episode.
@@ -244,6 +246,8 @@ class Environment(composer.Environment):
       SpecError: If the task is foreign, or if a sink cannot be saved.
       StateLayoutError: If a provider's state is not plain data.
     """
+    from realab_suite.engine import snapshots
+
     header = self.snapshot_header()
     worlds = snapshots.WorldStates(
         indices=None,
@@ -261,7 +265,7 @@ class Environment(composer.Environment):
     )
     return snapshots.Snapshot(header, worlds.to_data())
 
-  def restore(self, snapshot: snapshots.Snapshot) -> None:
+  def restore(self, snapshot: 'snapshots.Snapshot') -> None:
     """Sets this world to the state in a snapshot.
 
     It continues bit for bit like the saved world, including later episodes,
@@ -275,6 +279,8 @@ class Environment(composer.Environment):
       SpecError: If the task is a foreign task.
       StateLayoutError: If the snapshot does not fit. The state is unchanged.
     """
+    from realab_suite.engine import snapshots
+
     header = self.snapshot_header()
     saved = snapshots.WorldStates.from_snapshot(snapshot, header)
     if len(saved.seed) != 1:
@@ -322,6 +328,8 @@ class Environment(composer.Environment):
     Raises:
       SpecError: If the task is foreign, or if its bodies can sleep.
     """
+    from realab_suite.engine import snapshots
+
     self._refuse_if_closed()
     model = self._physics.model if model is None else model
     return {

@@ -26,7 +26,6 @@ from realab_suite.engine import placement
 from realab_suite.engine import replacement
 from realab_suite.entities import views
 from realab_suite.feedback import mechanisms
-from realab_suite.tasks import base
 
 
 @final
@@ -291,14 +290,3 @@ def check_start(
           f' be {depth:.2g} m inside {name!r} when the episode begins; place it'
           ' elsewhere'
       )
-
-
-def make_host(task: composer.Task) -> hosts.Host:
-  """Returns the host of one world.
-
-  Args:
-    task: Task of this package, or a foreign task.
-  """
-  if isinstance(task, base.Task):
-    return hosts.WorldHost(task)
-  return ForeignHost(task)

@@ -1,7 +1,7 @@
 """Physics of one world, with little overhead between MuJoCo and Python."""
 
 import operator
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
 
 from dm_control import mjcf
 from dm_control.mjcf import physics as mjcf_physics
@@ -9,9 +9,10 @@ from dm_control.rl import control
 import mujoco
 import numpy as np
 
-from realab_suite.engine import frame_renderer
-from realab_suite.engine import gl_contexts
 from realab_suite.entities import cameras
+
+if TYPE_CHECKING:
+  from realab_suite.engine import frame_renderer
 
 # Attributes of bound elements that belong to the state.
 _STATE = ('qpos', 'qvel', 'ctrl', 'mocap_pos', 'mocap_quat', 'active')
@@ -123,6 +124,9 @@ class ThinPhysics(mjcf.Physics):
     Raises:
       RenderingError: If no renderer is available.
     """
+    # Most programs make no pictures.
+    from realab_suite.engine import gl_contexts
+
     self._contexts = gl_contexts.for_pictures(self.model)
 
   def free(self) -> None:
@@ -169,6 +173,8 @@ class ThinPhysics(mjcf.Physics):
     self.refresh()
     size = height, width
     if size not in self._renderers:
+      from realab_suite.engine import frame_renderer
+
       self._renderers[size] = frame_renderer.FrameRenderer(
           self.model.ptr, height, width
       )

@@ -122,6 +122,11 @@ OTHER = register('other', code=1)
 NOTHING = register('nothing', code=0)
 """Class that the ray sense reports for rays that hit nothing in their range."""
 
+# Classes of one world each, whose modules are imported only to load them.
+GATE_PLATE = register('gate_plate', code=12, rgba=(0.9, 0.4, 0.1, 1.0))
+MARK = register('mark', code=13, rgba=(0.25, 0.6, 0.45, 1.0))
+SUPERVISOR = register('supervisor', code=18, rgba=(0.95, 0.85, 0.45, 1.0))
+
 
 def code(name: str) -> int:
   """Returns the code that the ray sense reports for the class `name`.

@@ -4,18 +4,21 @@ The results of single episodes are in this module; `comparison` compares runs.
 """
 
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 from realab_suite import errors
 from realab_suite import policies
 from realab_suite.config import integers
-from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
 from realab_suite.engine import events
 from realab_suite.evaluation import actors
-from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import monitors
 from realab_suite.evaluation import results
 from realab_suite.feedback import objectives
+
+if TYPE_CHECKING:
+  from realab_suite.engine import batch_environment
+  from realab_suite.evaluation import batch_actors
 
 
 def evaluate(
@@ -133,7 +136,8 @@ def results_of(
 
 
 def evaluate_batch(
-    batch: batch_environment.BatchEnvironment, actor: batch_actors.BatchActor
+    batch: 'batch_environment.BatchEnvironment',
+    actor: 'batch_actors.BatchActor',
 ) -> list[results.EpisodeResult]:
   """Runs an actor for one episode in every world of a batch.
 

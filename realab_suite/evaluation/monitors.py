@@ -6,11 +6,10 @@ read, are in `ledgers`.
 
 from collections.abc import Mapping, Sequence
 import math
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
-from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
 from realab_suite.engine import events
 from realab_suite.entities import protocols
@@ -20,6 +19,9 @@ from realab_suite.evaluation import results
 from realab_suite.feedback import mechanisms
 from realab_suite.feedback import objectives
 from realab_suite.tasks import base
+
+if TYPE_CHECKING:
+  from realab_suite.engine import batch_environment
 
 
 @final
@@ -105,7 +107,7 @@ class BatchMonitor(events.BatchEventSink):
     first: Result of the first episode that ended in each world, by index.
   """
 
-  def __init__(self, batch: batch_environment.BatchEnvironment) -> None:
+  def __init__(self, batch: 'batch_environment.BatchEnvironment') -> None:
     """Makes a monitor, to be passed to `batch.add_sink`.
 
     Args:

@@ -138,9 +138,33 @@ class ValueFunction(Reader):
     """
 
 
-POLICIES: registry.Registry[Callable[..., Policy]] = registry.Registry('policy')
+_MODULES = {
+    'apple_seeker': ('apple_seeker',),
+    'errands': ('goal_solver',),
+    'network_policies': ('network_demonstrator',),
+    'saboteurs': ('pushing_saboteur', 'carrying_saboteur', 'throwing_saboteur'),
+    'simple': ('no_op', 'random'),
+}
+# The solvers of worlds are defined beside them.
+_WORLDS = ('gates', 'off_switch', 'tidy_up', 'valued_things')
+POLICIES: registry.Registry[Callable[..., Policy]] = registry.Registry(
+    'policy',
+    {
+        name: f'realab_suite.policies.{module}'
+        for module, names in _MODULES.items()
+        for name in names
+    }
+    | {f'{world}_solver': f'realab_suite.tasks.{world}' for world in _WORLDS},
+)
 VALUE_FUNCTIONS: registry.Registry[Callable[..., ValueFunction]] = (
-    registry.Registry('value function')
+    registry.Registry(
+        'value function',
+        {
+            'apple_seeker_approval': 'realab_suite.policies.approval',
+            SOLVER_APPROVAL: 'realab_suite.policies.approval',
+            'network_values': 'realab_suite.policies.network_policies',
+        },
+    )
 )
 
 

@@ -27,8 +27,6 @@ from realab_suite.tasks import apple_rooms
 from realab_suite.tasks import layouts
 from realab_suite.tasks import registry
 
-PLATE = appearance.register('gate_plate', code=12, rgba=(0.9, 0.4, 0.1, 1.0))
-
 _PLATE_AT = np.array([-2.2, 2.6])
 _RADIUS = 0.5
 _APPLES_AT = [(-0.7, 4.9), (0.7, 4.9), (0.0, 5.5), (-0.7, 6.1), (0.7, 6.1)]
@@ -54,7 +52,7 @@ class Gates(apple_rooms.AppleRoom):
   def __init__(self, **options: Any) -> None:
     arena = arenas.TwoRooms(look=_LOOK)
     super().__init__(arena, **options)
-    arena.add_mark('plate', PLATE, _PLATE_AT, _RADIUS)
+    arena.add_mark('plate', appearance.GATE_PLATE, _PLATE_AT, _RADIUS)
     self._gate = doors.SlidingDoor('gate', width=arena.doorway_width)
     self._gate.attach_to(arena, arena.places['doorway'].position)
     self.add_apples(len(_APPLES_AT))

@@ -1,15 +1,19 @@
 """Names of tasks: a domain, and a task in it.
 
-A world registers itself where it is defined. `suite` imports all modules of
-this folder, and `--import` names those of other packages.
+A world registers itself where it is defined. The tasks of a domain of this
+package are in the module of that name, which is imported when one of them, or a
+list, is asked for. `--import` names modules of other packages.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 import functools
+import importlib
 import inspect
+import pkgutil
 from typing import Any, Final, TypeVar
 
 from realab_suite import errors
+from realab_suite import tasks
 from realab_suite.config import messages
 from realab_suite.tasks import base
 from realab_suite.tasks import layouts
@@ -23,6 +27,9 @@ TRAIN: Final = 'train'
 
 HELD_OUT: Final = 'held_out'
 """Tag of the members of a class of tasks that agents are judged on."""
+
+MODULES: Final = tuple(m.name for m in pkgutil.iter_modules(tasks.__path__))
+"""Names of the modules of this package, among them those of its domains."""
 
 _TASKS: dict[tuple[str, str], tuple[TaskFactory, frozenset[str]]] = {}
 
@@ -48,6 +55,7 @@ def register_task(
       )
 
   def decorate(factory: _Factory) -> _Factory:
+    _import(domain_name)
     if (domain_name, task_name) in _TASKS:
       raise errors.SpecError(
           f'task {domain_name}.{task_name} is registered already; allowed is'
@@ -121,17 +129,18 @@ def find(domain_name: str, task_name: str | None) -> TaskFactory:
     UnknownNameError: If there is no such task.
   """
   if isinstance(domain_name, str) and isinstance(task_name, str):
+    _import(domain_name)
     if (domain_name, task_name) in _TASKS:
       return _TASKS[domain_name, task_name][0]
   domains: dict[str, list[str]] = {}
-  for domain, task in _TASKS:
+  for domain, task in names():
     domains.setdefault(domain, []).append(task)
   listed = {k: f'{k}.{{{",".join(v)}}}' for k, v in domains.items()}
   given = _format(domain_name)
   known = [*domains]
   if task_name is not None:
     given = f'{given}.{_format(task_name)}'
-    known = [f'{domain}.{task}' for domain, task in _TASKS]
+    known = [f'{domain}.{task}' for domain, task in names()]
   elif given in listed:
     raise errors.UnknownNameError(
         f'task {given}: a domain alone; allowed are {listed[given]}'
@@ -154,7 +163,7 @@ def argument_names(factory: Callable[..., Any]) -> list[str] | None:
     The names; `None` if it passes arguments on to something else.
   """
   found = [inspect.signature(factory)]
-  made = factory.func if isinstance(factory, functools.partial) else factory
+  made = _made(factory)
   for one in inspect.getmro(made) if inspect.isclass(made) else ():
     if '__init__' in vars(one) and _passes_on(found[-1]):
       found.append(inspect.signature(vars(one)['__init__']))
@@ -175,6 +184,17 @@ def argument_names(factory: Callable[..., Any]) -> list[str] | None:
   )
 
 
+def _made(factory: Callable[..., Any]) -> Callable[..., Any]:
+  """Returns the class or function that a partial function calls."""
+  return factory.func if isinstance(factory, functools.partial) else factory
+
+
+def _import(domain_name: str) -> None:
+  """Imports the module of a domain of this package, which registers tasks."""
+  if domain_name in MODULES:
+    importlib.import_module(f'{tasks.__name__}.{domain_name}')
+
+
 def _passes_on(signature: inspect.Signature) -> bool:
   return any(
       parameter.kind == inspect.Parameter.VAR_KEYWORD
@@ -183,9 +203,27 @@ def _passes_on(signature: inspect.Signature) -> bool:
 
 
 def names(tag: str | None = None) -> tuple[tuple[str, str], ...]:
-  """Returns the `(domain, task)` names of all tasks, or of those with a tag."""
+  """Returns the `(domain, task)` names of all tasks, or of those with a tag.
+
+  Those of domains of this package come first, by domain.
+  """
+  for module in MODULES:
+    _import(module)
+  domains = dict.fromkeys([*MODULES, *(domain for domain, _ in _TASKS)])
   return tuple(
-      name for name, (_, tags) in _TASKS.items() if tag is None or tag in tags
+      name
+      for domain in domains
+      for name, (_, tags) in _TASKS.items()
+      if name[0] == domain and (tag is None or tag in tags)
+  )
+
+
+def of_package() -> tuple[tuple[str, str], ...]:
+  """Returns the `(domain, task)` names of the tasks of this package."""
+  return tuple(
+      name
+      for name in names()
+      if _made(_TASKS[name][0]).__module__.startswith(f'{tasks.__name__}.')
   )
 
 

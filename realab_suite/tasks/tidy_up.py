@@ -30,8 +30,6 @@ from realab_suite.tasks import layouts
 from realab_suite.tasks import registry
 from realab_suite.tasks import rooms
 
-MARK = appearance.register('mark', code=13, rgba=(0.25, 0.6, 0.45, 1.0))
-
 _ROWS = (0.3, 1.3, 2.3, 3.3)
 _NAMES = tuple(f'crate_{i}' for i in range(1, len(_ROWS) + 1))
 _CRATES_AT, _SPREAD = 1.0, (0.2, 0.0)
@@ -64,7 +62,8 @@ class TidyUp(rooms.RoomTask):
     super().__init__(arena, **options)
     self._crates = [crates.Crate(name) for name in _NAMES]
     for crate, y, mark in zip(self._crates, _ROWS, _MARKS, strict=True):
-      arena.add_mark(f'mark_of_{crate.mjcf_model.model}', MARK, mark, _RADIUS)
+      name = f'mark_of_{crate.mjcf_model.model}'
+      arena.add_mark(name, appearance.MARK, mark, _RADIUS)
       self.add_crate(crate, (_CRATES_AT, y), _SPREAD)
     self._tidy = world_state.Slot(arena.mjcf_model, 'tidy')
 

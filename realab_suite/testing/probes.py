@@ -78,6 +78,7 @@ from realab_suite.entities import arenas
 from realab_suite.entities import protocols
 from realab_suite.feedback import specs
 from realab_suite.policies import action_sets
+from realab_suite.policies import approval
 from realab_suite.policies import base as policies_base
 from realab_suite.policies import random_keys
 from realab_suite.tasks import base
@@ -289,9 +290,9 @@ class Pusher(_Always):
 
 
 @policies.VALUE_FUNCTIONS.add('probe_approval')
-def probe_approval() -> policies.PolicyApproval:
+def probe_approval() -> approval.PolicyApproval:
   """Returns the approval of working: 1, of waiting -0.41, of pushing -1."""
-  return policies.PolicyApproval('probe_worker')
+  return approval.PolicyApproval('probe_worker')
 
 
 @final

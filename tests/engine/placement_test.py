@@ -211,6 +211,26 @@ class _Rod(registers.Register):
     return np.stack(both, axis=-1) / self._scale
 
 
+class _OfOneWorld(_Rod):
+  """Cannot compute with the values of several worlds."""
+
+  def _places(self, physics, value):
+    float(value[0])
+    return super()._places(physics, value)
+
+
+def test_a_kind_that_serves_one_world_alone_is_refused():
+  with helpers.registered(
+      register_kinds.REGISTER_KINDS, 'test_rod', _OfOneWorld
+  ):
+    with pytest.raises(
+        errors.SpecError,
+        match=r"register 'value': _OfOneWorld cannot be posed at several values"
+        r' at once: .*; its methods must accept values `\(\.\.\.\)`',
+    ):
+      _embed(_room_with(), [0.0, 2.0], kind='test_rod', range=[-1, 4])
+
+
 @pytest.mark.parametrize(('x', 'is_refused'), [(-0.4, True), (-0.8, False)])
 def test_ports_are_posed_with_unequal_values(x, is_refused):
   # The left bead is 0.3 m beside the start if its ports have -1 and 4.

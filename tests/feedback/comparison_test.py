@@ -10,8 +10,9 @@ from realab_suite import policies
 from realab_suite import suite
 from realab_suite import worlds
 from realab_suite.evaluation import evaluate
-from realab_suite.feedback import providers
 from realab_suite.feedback import specs
+from realab_suite.feedback.providers import comparison
+from realab_suite.feedback.providers import paired_advice
 from realab_suite.lab.verdicts import judging
 
 _SILENT = None
@@ -21,7 +22,7 @@ def _compare(
     readings: dict[str, list[float]], starts: tuple[int, ...] = (0,), **fields
 ) -> list[float | None]:
   """Returns what is written in each step; `None` where nothing is."""
-  provider = providers.Comparison(
+  provider = comparison.Comparison(
       reads=tuple(readings), writes=('better',), **fields
   )
   state = provider.initial_state(())
@@ -86,7 +87,7 @@ def test_a_critique_says_which_of_two_actions_is_better(
     def step(self, observation, episode_start, key, state):
       return np.arange(len(self.action_set), dtype=float), state
 
-  critic = providers.PairedAdvice(
+  critic = paired_advice.PairedAdvice(
       value_function='apple_seeker_approval', reads=('one', 'other'),
       writes=('critique',), tolerance=tolerance,
   )  # fmt: skip

@@ -18,6 +18,8 @@ from realab_suite.entities import registers
 from realab_suite.evaluation import actors
 from realab_suite.feedback import providers
 from realab_suite.feedback import specs
+from realab_suite.feedback.providers import demonstration
+from realab_suite.feedback.providers import paired_advice
 from realab_suite.lab.verdicts import obstacles
 from realab_suite.testing import providers as contract
 from tests import registries
@@ -327,10 +329,10 @@ def test_a_design_names_the_solver_of_its_world():
 def test_providers_with_own_senses_keep_the_contract():
   domain, task = _WORLDS['good_objects']
   for provider in (
-      providers.Demonstration(
+      demonstration.Demonstration(
           policy='solver', senses='own', writes=('reward',)
       ),
-      providers.PairedAdvice(
+      paired_advice.PairedAdvice(
           value_function='solver_approval', senses='own',
           reads=('one', 'two'), writes=('reward',),
       ),

@@ -12,6 +12,7 @@ from realab_suite.evaluation import actors
 from realab_suite.evaluation import batch_actors
 from realab_suite.policies import action_sets
 from realab_suite.policies import macros
+from realab_suite.policies import simple
 from realab_suite.tasks import collect_apples
 
 _ACTIONS = (
@@ -132,7 +133,7 @@ def test_the_apple_seeker_walks_where_it_can_only_walk():
   seeker = policies.make('apple_seeker')
   assert seeker.in_action_set(everything) is seeker
   assert seeker.action_set is everything
-  walker = policies.Distracted(seeker, 0.5).in_action_set(walk)
+  walker = simple.Distracted(seeker, 0.5).in_action_set(walk)
   assert walker.action_set is walk
 
 

@@ -111,7 +111,7 @@ def test_a_shipped_network_is_small_and_records_its_training(name):
 
 
 def test_a_shipped_network_reaches_its_return(shipped):
-  returns = _returns(policies.NetworkDemonstrator(shipped), 'standard')
+  returns = _returns(network_policies.NetworkDemonstrator(shipped), 'standard')
   assert len(returns) == 16
   assert returns.mean() >= 15
   assert (returns >= 10).mean() >= 0.8
@@ -163,10 +163,10 @@ def test_features_and_outputs_equal_those_of_the_learners(shipped, views):
 
 
 def test_the_demonstrator_takes_the_action_with_the_best_advice(shipped, views):
-  policy = policies.NetworkDemonstrator(shipped)
+  policy = network_policies.NetworkDemonstrator(shipped)
   start = np.ones(256, bool)
   action, state = policy.step(views, start, _KEY, policy.initial_state((256,)))
-  adviser = policies.NetworkValues(shipped)
+  adviser = network_policies.NetworkValues(shipped)
   values, _ = adviser.step(views, start, _KEY, adviser.initial_state((256,)))
   assert state == ()
   assert values.shape == (256, 14)

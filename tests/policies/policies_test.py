@@ -13,6 +13,7 @@ from realab_suite.entities import avatars
 from realab_suite.feedback import providers
 from realab_suite.policies import action_sets
 from realab_suite.policies import navigation
+from realab_suite.policies import simple
 from tests.engine import helpers
 
 _CONTROLS = action_sets.DMLAB_LIKE.table(avatars.ACTIONS)
@@ -222,7 +223,7 @@ def test_wrong_names_and_options_are_refused(make, name, options, message):
 
 @pytest.mark.parametrize('share', [0.3, 1.0])
 def test_a_distracted_policy_acts_at_random_in_a_share_of_steps(share):
-  policy = policies.Distracted(policies.make('no_op'), share)
+  policy = simple.Distracted(policies.make('no_op'), share)
   keys = np.arange(4000, dtype=np.uint64).reshape(2000, 2)
   start = np.zeros(2000, bool)
   chosen, _ = policy.step({}, start, keys, policy.initial_state((2000,)))

@@ -216,8 +216,18 @@ class Measurement(validation.Model):
     return f'{self.kind}({listed})' if listed else self.kind
 
 
+_MODULES = {
+    'events': ('score', 'collected', 'time'),
+    'motion': ('distance', 'position', 'speed', 'contacts'),
+    'tampering': ('register_moved', 'detector'),
+}
 MEASUREMENTS: registry.Registry[type[Measurement]] = registry.Registry(
-    'measurement kind'
+    'measurement kind',
+    {
+        kind: f'realab_suite.feedback.measurements.{module}'
+        for module, kinds in _MODULES.items()
+        for kind in kinds
+    },
 )
 
 

@@ -188,8 +188,21 @@ class Provider(validation.Model):
     """
 
 
+_KINDS = (
+    'appraisal',
+    'comparison',
+    'constant',
+    'demonstration',
+    'difference',
+    'growth',
+    'inspection',
+    'paired_advice',
+    'relay',
+    'value_advice',
+)
 PROVIDERS: registry.Registry[type[Provider]] = registry.Registry(
-    'provider kind'
+    'provider kind',
+    {kind: f'realab_suite.feedback.providers.{kind}' for kind in _KINDS},
 )
 
 

@@ -14,6 +14,7 @@ from realab_suite.evaluation import actors
 from realab_suite.feedback import specs
 from realab_suite.lab.audit import aiming
 from realab_suite.policies import macros
+from realab_suite.policies import simple
 from tests.lab.audit import designs
 
 _TURNED = {'position': [1.5, -2.0], 'yaw': math.pi / 2}
@@ -142,7 +143,7 @@ def test_the_solver_is_that_of_the_world(env):
 
 def test_only_a_policy_that_needs_an_aim_needs_a_register(env):
   policy = aiming.make_policy('no_op', env, 'rewrad', 0)
-  assert isinstance(policy, policies.NoOp)
+  assert isinstance(policy, simple.NoOp)
   with pytest.raises(errors.SpecError, match="no 'rewrad'"):
     aiming.make_policy('aimed_in_a_test', env, 'rewrad', 0)
 
