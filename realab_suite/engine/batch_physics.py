@@ -8,6 +8,7 @@ Its state arrays are live. Derived quantities are updated when they are read.
 import abc
 from collections.abc import Iterable
 import copy
+import functools
 import operator
 from typing import Any, final
 
@@ -78,6 +79,7 @@ class BatchPhysics:
       sleep: True to let blocks at rest sleep.
     """
     self._template = template
+    self._num_threads = num_threads
     self._model = template.model
     if sleep:
       # The compiled model specifies which bodies may sleep: all except the
@@ -89,17 +91,22 @@ class BatchPhysics:
     self._batch = mujoco_batch.Batch(
         self._model.ptr, num_envs, num_threads, persistent=sleep
     )
-    # Another batch computes poses and casts rays in a copy of the state. It
-    # ignores contacts and constraints, which would take several times as long,
-    # and no body sleeps in it, so all geoms are at their present positions.
-    still = copy.copy(template.model)
-    still.opt.disableflags |= int(_NEEDLESS)
-    self._poses = mujoco_batch.Batch(still.ptr, num_envs, num_threads)
     self._data = _Data(self._batch.bind('userdata'), self._batch.bind('time'))
     self._bindings: dict[Any, _BatchBinding] = {}
     self._is_dirty = True
     self._stage = _POSITIONS
     self._worlds: dict[int, _WorldView] = {}
+
+  @functools.cached_property
+  def _poses(self) -> mujoco_batch.Batch:
+    """Another batch: it computes poses and casts rays in a copy of the state.
+
+    It ignores contacts and constraints, which would take several times as long,
+    and no body sleeps in it, so all geoms are at their present positions.
+    """
+    still = copy.copy(self._template.model)
+    still.opt.disableflags |= int(_NEEDLESS)
+    return mujoco_batch.Batch(still.ptr, self.num_envs, self._num_threads)
 
   @property
   def num_envs(self) -> int:

@@ -387,8 +387,14 @@ class Space:
     self._is_measured = is_solid & ~np.isin(model.geom_type, _GROUND)
     self._half = np.abs(model.geom_aabb[:, :3]) + model.geom_aabb[:, 3:]
     self._half[self.is_plane] = _ENDLESS
-    names = [model.geom(i).name or f'geom {i}' for i in range(model.ngeom)]
-    self._names = np.array(names, object)
+    kind = mujoco.mjtObj.mjOBJ_GEOM
+    self._names = np.array(
+        [
+            mujoco.mj_id2name(model, kind, i) or f'geom {i}'
+            for i in range(model.ngeom)
+        ],
+        object,
+    )
     self._model = model = copy.copy(model)
     # Rays find what stays in place, whether it is visible or not.
     model.geom_group[:] = np.where(is_solid & (bodies == 0), 0, 1)
