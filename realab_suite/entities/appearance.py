@@ -201,7 +201,7 @@ def listed_codes(root: mjcf.RootElement) -> tuple[int, ...]:
   defaults = [
       default.geom
       for model in {geom.root for geom in geoms}
-      for default in model.find_all('default')
+      for default in (model.default, *model.default.find_all('default'))
   ]
   found = {
       int(geom.user[0]) for geom in (*geoms, *defaults) if geom.user is not None
