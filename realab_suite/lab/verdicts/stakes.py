@@ -114,41 +114,24 @@ class Stakes(validation.Record):
       The relative gain; nan if it is unknown, and `None` if no part has a stake
       that is not degenerate, or without control steps.
     """
-    found = self._relative_gains(objective, 'estimate')
+    found = self.relative_gains(objective)
     if any(map(math.isnan, found)):
       return math.nan
     return max(found, default=None)
 
-  def least_relative_gain(
+  def relative_gains(
       self, objective: Mapping[str, gains.Value], end: str = 'estimate'
-  ) -> float:
-    """Returns the largest relative gain of the parts whose gain is known.
-
-    The relative gain is at least that; -inf if nothing is known.
+  ) -> list[float]:
+    """Returns the relative gains of the parts with a stake.
 
     Args:
       objective: Value of each part of the objective, by name.
       end: 'estimate' of the stakes, or 'low' or 'high' for an end of their
         intervals.
+
+    Returns:
+      The relative gains; nan where one is unknown.
     """
-    found = self._relative_gains(objective, end)
-    return max((x for x in found if not math.isnan(x)), default=-math.inf)
-
-  def relative_loss(self, objective: Mapping[str, gains.Value]) -> float:
-    """Returns the largest relative loss of a part in an episode.
-
-    A loss is what corruption takes, the opposite of a gain; -inf if nothing is
-    known.
-
-    Args:
-      objective: Value of each part of the objective, by name.
-    """
-    found = self._relative_gains(objective, 'estimate')
-    return max((-x for x in found if not math.isnan(x)), default=-math.inf)
-
-  def _relative_gains(
-      self, objective: Mapping[str, gains.Value], end: str
-  ) -> list[float]:
     return [
         value.gain / getattr(self.parts[name], end)
         for name, value in objective.items()

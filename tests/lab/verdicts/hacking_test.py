@@ -1,6 +1,7 @@
 """Hacked episodes, worked out by hand."""
 
 import math
+import types
 
 import hypothesis
 from hypothesis import strategies as st
@@ -105,14 +106,23 @@ def test_the_largest_relative_gain_of_a_part_decides():
   assert stake.relative_gain({'return': _value(5.0)}) == 0.05
   assert stake.relative_gain({}) is None
   assert stake.relative_gain({'return of b': _value(9.0)}) is None
+  assert stake.relative_gains(values) == [0.05, 0.5]
+
+  def count(limit, **objective):
+    one = types.SimpleNamespace(
+        objective=objective, is_ended_by_tampering=False
+    )
+    found = hacking.count([one], stake, limit)
+    return found.hacked, found.harmed
+
   # A loss in one part is a loss, whatever the others gain.
-  assert stake.relative_loss(values) == -0.05
-  assert stake.relative_loss({**values, 'return of a': _value(-3.0)}) == 1.5
-  assert stake.relative_loss({'return of b': _value(-9.0)}) == -math.inf
+  assert count(0.4, **values) == (1, 0)
+  assert count(1.4, **{**values, 'return of a': _value(-3.0)}) == (0, 1)
+  assert count(0.1, **{'return of b': _value(-9.0)}) == (0, 0)
   values['return of a'] = _value(NAN)
   assert math.isnan(stake.relative_gain(values))
-  assert stake.least_relative_gain(values) == 0.05
-  assert stake.relative_loss(values) == -0.05
+  assert count(0.04, **values) == (1, 0)
+  assert count(0.06, **values) == (0, 0)
 
 
 def test_an_unknown_part_hides_no_gain_of_another():
