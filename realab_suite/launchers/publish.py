@@ -5,7 +5,7 @@ r"""Publishes the results of a sweep: small files that anybody can read.
 
 `report` and `scorecard` read the folder like that of the sweep. The tables are
 Parquet files: `pandas.read_parquet('docs/results/paper/rows.parquet')`. Actions
-and learners are left out, so films and paths need the experiment again.
+and learners are left out, so films need the experiment again.
 """
 
 import pathlib

@@ -1,4 +1,4 @@
-r"""Writes a report of a sweep: a page with tables, curves, plots and clips.
+r"""Writes a report of a sweep: a page with tables, learning curves and clips.
 
   python -m realab_suite.launchers.report --input=results/paper
 

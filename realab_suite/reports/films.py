@@ -5,7 +5,6 @@ Films are for people; cameras of agents are not used here.
 
 from collections.abc import Callable, Iterator, Sequence
 import contextlib
-import io
 import os
 import pathlib
 from typing import Any
@@ -17,7 +16,6 @@ import numpy as np
 from PIL import Image
 from PIL import ImageDraw
 from PIL import ImageFont
-import tqdm
 
 from realab_suite import errors
 from realab_suite.engine import environment
@@ -133,53 +131,6 @@ def film(
     if is_empty:
       os.remove(path)
     raise
-
-
-@contextlib.contextmanager
-def all_views(
-    env: environment.Environment, folder: pathlib.Path, name: str
-) -> Iterator[OnStep]:
-  """Opens one film per view; yields a function that adds a frame to each.
-
-  A progress bar shows the control steps, because an episode takes minutes
-  without a graphics card.
-
-  Args:
-    env: Environment to film.
-    folder: Folder of the films, with names `name_view.mp4`.
-    name: Title of the films.
-  """
-  with contextlib.ExitStack() as stack:
-    adders = [
-        stack.enter_context(
-            film(env, folder / f'{name}_{view}.mp4', name, [view])
-        )
-        for view in WIDTHS
-    ]
-    bar = stack.enter_context(
-        tqdm.tqdm(
-            desc=f'filming {name}',
-            total=env.max_steps,
-            disable=None,
-            unit='step',
-            leave=False,
-        )
-    )
-
-    def add(physics: protocols.Physics, track: tracking.Track) -> None:
-      for adder in adders:
-        adder(physics, track)
-      bar.update(track.num_steps - bar.n)
-
-    yield add
-
-
-def last_frame(path: str | os.PathLike[str]) -> bytes:
-  """Returns the last frame of a film, as JPEG."""
-  frames = imageio.imread(pathlib.Path(path), plugin='pyav')
-  file = io.BytesIO()
-  Image.fromarray(frames[-1]).save(file, 'JPEG', quality=80)
-  return file.getvalue()
 
 
 def draw_strip(title: str, track: tracking.Track, width: int) -> np.ndarray:

@@ -4,9 +4,8 @@
 """
 
 import collections
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 import dataclasses
-import functools
 import math
 from typing import Any, NamedTuple, final
 
@@ -86,7 +85,10 @@ class Figures:
     coverage: Share of writes that were read.
     gap: Tampering gap: true return of the secure twin minus that of the run;
       `None` without a twin.
-    stages: Task and summary of each stage before adaptation, by its name.
+    stages: True return of each stage before adaptation, by its name.
+    training: Training episodes of all seeds in which tampering paid, or `None`.
+    label: Labels of the seeds with their numbers, the most frequent one first.
+    columns: Figures of the run in the tables, by their columns.
   """
 
   run: sweep_results.Run
@@ -100,38 +102,10 @@ class Figures:
   outcomes: Mapping[str, intervals.Interval]
   coverage: float | None
   gap: intervals.Interval | None
-  stages: Mapping[str, tuple[str, comparison.RunSummary]]
-
-  @functools.cached_property
-  def columns(self) -> dict[str, tables.Figure]:
-    """Figures of the run in the tables, by their columns."""
-    figures = result_tables.columns(self.summary, self.hacking)
-    return {'run': self.run.name, 'agent': self.run.jobs[0].kind, **figures}
-
-  @property
-  def label(self) -> str:
-    """Labels of the seeds with their numbers, the most frequent one first."""
-    counts = collections.Counter(
-        seed.judgement.label.value for seed in self.seeds.values()
-    )
-    total = len(self.seeds)
-    if len(counts) == 1:
-      [label] = counts
-      return f'{label} (all {total} seeds)' if total > 1 else label
-    return ', '.join(
-        f'{label} ({count} of {total})' for label, count in counts.most_common()
-    )
-
-  @property
-  def training(self) -> verdicts.Training | None:
-    """Training episodes of all seeds in which tampering paid."""
-    known = [seed.training for seed in self.seeds.values() if seed.training]
-    if not known:
-      return None
-    return verdicts.Training(
-        sum(training.paid for training in known),
-        sum(training.episodes for training in known),
-    )
+  stages: Mapping[str, intervals.Interval]
+  training: verdicts.Training | None
+  label: str
+  columns: Mapping[str, tables.Figure]
 
 
 def compute(
@@ -157,6 +131,11 @@ def compute(
 
 def _figures(sweep: sweep_results.Sweep, run: sweep_results.Run) -> Figures:
   counting = [row for row in run.rows if row.counts]
+  summary, twin = comparison.summary(run.name, run.rows), sweep.twin(run)
+  gap = None if twin is None else gained(twin, run)
+  means, coverage = _means(counting), _coverage(counting)
+  outcomes = _outcomes([row for row in run.rows if row.is_valid])
+  stages = _stages(run)
   hacked, seeds, verdict, audit = None, {}, None, None
   stake, why = _stake(run)
   if stake is not None:
@@ -173,13 +152,6 @@ def _figures(sweep: sweep_results.Sweep, run: sweep_results.Run) -> Figures:
     seeds = {seed: Seed(unknown, None, None, None) for seed in run.configs}
   if is_judged:
     verdict = verdicts.verdict([seed.judgement for seed in seeds.values()])
-  coverage = [
-      register.coverage
-      for row in counting
-      for register in row.registers.values()
-      if register.coverage is not None
-  ]
-  twin, summary = sweep.twin(run), comparison.summary(run.name, run.rows)
   return Figures(
       run=run,
       summary=summary,
@@ -188,25 +160,61 @@ def _figures(sweep: sweep_results.Sweep, run: sweep_results.Run) -> Figures:
       verdict=verdict,
       audit=audit,
       fails=_fails(sweep, run, summary.true_return),
-      means=_means(counting),
-      outcomes=_outcomes([row for row in run.rows if row.is_valid]),
-      coverage=float(np.mean(coverage)) if coverage else None,
-      gap=None if twin is None else gained(twin, run),
-      stages=_stages(run),
+      means=means,
+      outcomes=outcomes,
+      coverage=coverage,
+      gap=gap,
+      stages=stages,
+      training=_training(seeds.values()),
+      label=_label(seeds.values()),
+      columns={
+          'run': run.name,
+          'agent': run.jobs[0].kind,
+          **result_tables.columns(summary, hacked),
+      },
   )
 
 
-def _stages(
-    run: sweep_results.Run,
-) -> dict[str, tuple[str, comparison.RunSummary]]:
-  """Returns the stages of a run in which an episode counts."""
-  found = {}
+def _coverage(counting: _Rows) -> float | None:
+  """Returns the share of writes that were read, or `None` without writes."""
+  coverage = [
+      register.coverage
+      for row in counting
+      for register in row.registers.values()
+      if register.coverage is not None
+  ]
+  return float(np.mean(coverage)) if coverage else None
+
+
+def _training(seeds: Collection[Seed]) -> verdicts.Training | None:
+  known = [seed.training for seed in seeds if seed.training]
+  if not known:
+    return None
+  return verdicts.Training(
+      sum(training.paid for training in known),
+      sum(training.episodes for training in known),
+  )
+
+
+def _label(seeds: Collection[Seed]) -> str:
+  counts = collections.Counter(seed.judgement.label.value for seed in seeds)
+  if len(counts) == 1:
+    [label] = counts
+    return f'{label} (all {len(seeds)} seeds)' if len(seeds) > 1 else label
+  return ', '.join(
+      f'{label} ({count} of {len(seeds)})'
+      for label, count in counts.most_common()
+  )
+
+
+def _stages(run: sweep_results.Run) -> dict[str, intervals.Interval]:
+  """Returns the true return of each stage in which an episode counts."""
+  true_returns = {}
   for stage in jobs.STAGES:
     rows = [row for row in run.stages if row.info.run.endswith(f'.{stage}')]
     if any(row.counts for row in rows):
-      tasks = dict.fromkeys(f'{r.info.domain}.{r.info.task}' for r in rows)
-      found[stage] = ', '.join(tasks), comparison.summary(run.name, rows)
-  return found
+      true_returns[stage] = comparison.summary(run.name, rows).true_return
+  return true_returns
 
 
 def _stake(run: sweep_results.Run) -> tuple[stakes.Stakes | None, str]:

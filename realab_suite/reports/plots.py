@@ -1,16 +1,14 @@
-"""Plots: charts in the page of a report, and plots of single episodes.
+"""Plots: learning curves of a report, and trajectories of a comparison.
 
-Charts are SVG, plots of episodes are PNG. Equal figures give equal bytes.
+Curves are SVG, trajectories are PNG. Equal figures give equal bytes.
 """
 
 import base64
 from collections.abc import Iterable, Mapping, Sequence
-import dataclasses
 import io
 import math
-import os
 import pathlib
-from typing import IO, Any, NamedTuple, final
+from typing import Any, NamedTuple, final
 
 import matplotlib
 from matplotlib import cm
@@ -24,7 +22,6 @@ from matplotlib import ticker
 import numpy as np
 
 from realab_suite.entities import appearance
-from realab_suite.lab.experiments import replays
 from realab_suite.lab.experiments import sweep_results
 from realab_suite.lab.experiments import tracking
 from realab_suite.lab.verdicts import comparison
@@ -33,29 +30,20 @@ from realab_suite.lab.verdicts import intervals
 from realab_suite.reports import numbers
 
 _Figures = Mapping[str, numbers.Figures]
-_Styles = Mapping[str, 'Style']
 _Tracks = Mapping[str, tracking.Track]
 
 # Palette of Okabe and Ito, for readers with and without colour blindness.
-# Yellow is left out because it is hard to see on white. Markers distinguish
-# runs without colour.
-_VERMILLION, _PURPLE = '#D55E00', '#CC79A7'
-_ORANGE, _SKY_BLUE = '#E69F00', '#56B4E9'
+# Yellow is left out because it is hard to see on white.
 _COLOURS = (
-    '#0072B2', _VERMILLION, '#009E73', _PURPLE, _ORANGE, _SKY_BLUE, '#000000',
+    '#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9', '#000000',
 )  # fmt: skip
-_MARKERS = ('o', 's', '^', 'D', 'v', 'P', 'X')
 _GREY = '#767676'
 _INK = '#222222'
-_PALE = 0.55
 _FLOOR = '0.95'
-_DOOR = (0.71, 0.396, 0.114, 1.0)
-_WALL = (0.769, 0.784, 0.812, 1.0)
 _HALO = [patheffects.withStroke(linewidth=2.5, foreground='white')]
 _DOTTED: Any = {'facecolor': 'none', 'edgecolor': _INK, 'linestyle': ':'}
 # Sizes in inches, and numbers of columns.
 _WIDTH, _ROW = 11.4, 1.7
-_MAP, _MAP_COLUMNS = 2.8, 4
 _PANELS, _WIDEST_PANEL, _PANEL_COLUMNS = 11.1, 5.0, 3
 # Longest name that is drawn in full, in characters.
 _LONGEST_NAME = 24
@@ -65,16 +53,13 @@ _LARGEST_RATIO = 20.0
 _UNMOVED = 0.05
 # The pressed pad is a part of the post of the pad.
 _HIDDEN = 'pressed_pad'
-_TIDY_AXES: Any = {
+STYLE: Any = {
     'axes.grid': True,
     'axes.axisbelow': True,
     'axes.spines.top': False,
     'axes.spines.right': False,
     'grid.color': '#e6e6e6',
     'grid.linewidth': 0.6,
-}
-STYLE: Any = {
-    **_TIDY_AXES,
     'svg.fonttype': 'none',  # Text stays small and searchable.
     'svg.hashsalt': 'realab_suite',
     'font.family': 'sans-serif',
@@ -91,40 +76,9 @@ STYLE: Any = {
 """Settings of Matplotlib for charts."""
 
 
-@final
-class Style(NamedTuple):
-  """Colour and marker of a design, its twin and its baselines."""
-
-  colour: str
-  marker: str
-
-
-def styles(names: Sequence[str]) -> dict[str, Style]:
-  """Returns a distinct style for each name; it depends on their order only."""
-  return {
-      name: Style(
-          _COLOURS[i % len(_COLOURS)],
-          # With more designs than colours, markers make new pairs.
-          _MARKERS[(i + i // len(_COLOURS)) % len(_MARKERS)],
-      )
-      for i, name in enumerate(names)
-  }
-
-
-@final
-@dataclasses.dataclass(frozen=True)
-class Picture:
-  """A picture in the page.
-
-  Attributes:
-    title: Title of the picture.
-    note: Explanation of the picture.
-    uri: Data URI of the picture.
-  """
-
-  title: str
-  note: str
-  uri: str
+def colours(names: Sequence[str]) -> dict[str, str]:
+  """Returns the colour of each name; it depends on their order only."""
+  return {name: _COLOURS[i % len(_COLOURS)] for i, name in enumerate(names)}
 
 
 def data_uri(kind: str, data: bytes) -> str:
@@ -137,24 +91,17 @@ def to_svg(canvas: figure.Figure) -> bytes:
   file = io.BytesIO()
   # Dates and versions would make equal figures differ.
   no_metadata = {key: None for key in ('Date', 'Creator', 'Format', 'Type')}
-  canvas.savefig(
-      file,
-      format='svg',
-      metadata=no_metadata,
-      bbox_inches='tight',
-      pad_inches=0.05,
-  )
+  with matplotlib.rc_context(STYLE):
+    canvas.savefig(
+        file,
+        format='svg',
+        metadata=no_metadata,
+        bbox_inches='tight',
+        pad_inches=0.05,
+    )
   data = file.getvalue()
   # The document type before this contains a web address.
   return data[data.index(b'<svg') :]
-
-
-def _picture(
-    title: str, note: str, canvas: figure.Figure, handles: list[Any]
-) -> Picture:
-  """Returns a figure with a legend as a picture of the page."""
-  _add_legend(canvas, handles)
-  return Picture(title, note, data_uri('image/svg+xml', to_svg(canvas)))
 
 
 def _subplots(
@@ -182,22 +129,6 @@ def _add_legend(canvas: figure.Figure, handles: list[Any]) -> None:
       frameon=False,
       fontsize=8.5,
   )
-
-
-def _extent(
-    shapes: Sequence[tracking.Shape],
-) -> tuple[np.ndarray, np.ndarray]:
-  """Returns the lowest and the highest corner around shapes, with a margin."""
-  corners = np.concatenate([shape.outline for shape in shapes])
-  return corners.min(axis=0) - 0.1, corners.max(axis=0) + 0.1
-
-
-def _draw_shapes(ax: Any, shapes: Iterable[tracking.Shape]) -> None:
-  """Draws shapes from above, in their order."""
-  for shape in shapes:
-    ax.add_patch(
-        patches.Polygon(shape.outline, facecolor=shape.colour, linewidth=0)
-    )
 
 
 def _draw_block(
@@ -298,10 +229,30 @@ _COLUMNS = (
 )
 
 
+LEARNING_NOTE = (
+    'Each point is a mean over the training episodes that ended since the'
+    ' previous point; the interval is long enough for an episode in every'
+    " world. The relative gain is what corruption adds to the learner's"
+    ' objective, in units of the stake; episodes above'
+    f' {hacking.SHARE_OF_STAKE:g} may be hacked. Observed returns are in the'
+    ' units of each register. Points with episodes from fewer than half of the'
+    ' worlds are omitted.'
+)
+"""Explanation of the chart `learning`."""
+
+
 def learning(
-    sweep: sweep_results.Sweep, figures: _Figures, styles: _Styles
-) -> Picture | None:
-  """Returns the chart of returns and relative gain over training."""
+    sweep: sweep_results.Sweep,
+    figures: _Figures,
+    run_colours: Mapping[str, str],
+) -> figure.Figure | None:
+  """Returns the chart of returns and relative gain over training.
+
+  Args:
+    sweep: The sweep.
+    figures: Figures of its runs.
+    run_colours: Colour of each learned run, by its name.
+  """
   rows = [
       done
       for run in sweep.learned()
@@ -318,7 +269,7 @@ def learning(
     largest = [0.0] * len(_COLUMNS)
     for row, runs in zip(axes, rows, strict=True):
       name = sweep.family(runs[0])
-      colour = styles[name].colour
+      colour = run_colours[name]
       for i, (_, key, _) in enumerate(_COLUMNS):
         for run in runs:
           one = _band(run, key)
@@ -363,18 +314,8 @@ def learning(
     if any(np.isfinite(one.low).any() for one in every):
       label = '95 % interval over seeds'
       handles.append(patches.Patch(color=_INK, alpha=0.15, label=label))
-    return _picture(
-        'Learning curves',
-        'Each point is a mean over the training episodes that ended since the'
-        ' previous point; the interval is long enough for an episode in every'
-        " world. The relative gain is what corruption adds to the learner's"
-        ' objective, in units of the stake; episodes above'
-        f' {hacking.SHARE_OF_STAKE:g} may be hacked. Observed returns are in'
-        ' the units of each register. Points with episodes from fewer than half'
-        ' of the worlds are omitted.',
-        canvas,
-        handles,
-    )
+    _add_legend(canvas, handles)
+  return canvas
 
 
 def _band(run: sweep_results.Run, key: str) -> Band:
@@ -438,181 +379,19 @@ def _set_symlog(ax: Any, threshold: float) -> None:
   ax.yaxis.set_major_formatter(ticker.StrMethodFormatter('{x:,.5g}'))
 
 
-def plane(
-    sweep: sweep_results.Sweep, figures: _Figures, styles: _Styles
-) -> Picture | None:
-  """Returns the chart of true return against hack rate."""
-  baselines = {one.run.baseline for one in figures.values()}
-  drawn = [
-      (one, found)
-      for name, one in figures.items()
-      if (found := one.hacking) is not None
-      if sweep.family(one.run) in styles
-      if not one.run.is_scripted or name in baselines
-  ]
-  if not drawn:
-    return None
-  with matplotlib.rc_context(STYLE):
-    canvas, [[ax]] = _subplots(1, 1, (8.6, 5.2))
-    for one, found in drawn:
-      colour, marker = styles[sweep.family(one.run)]
-      if one.run.is_scripted:
-        colour, marker = _GREY, 'd'
-      look = {
-          'linestyle': '',
-          'marker': marker,
-          'color': colour,
-          'mfc': 'white' if one.run.twin_of is not None else colour,
-      }
-      returns = comparison.by_seed(
-          [row for row in one.run.rows if row.counts], 'true_return'
-      )
-      ax.plot(
-          [100 * count.rate for count in found.by_seed.values()],
-          [np.mean(returns[seed]) for seed in found.by_seed],
-          markersize=3.5, alpha=_PALE, zorder=3, **look,
-      )  # fmt: skip
-      x, y = found.rate.scaled(100), one.summary.true_return
-      if math.isfinite(x.low):
-        ax.plot([x.low, x.high], [y.estimate] * 2, color=colour, lw=1.2)
-      if math.isfinite(y.low):
-        ax.plot([x.estimate] * 2, [y.low, y.high], color=colour, lw=1.2)
-      ax.plot(x.estimate, y.estimate, markersize=9, zorder=4, **look)
-    ax.set(xlabel='hack rate (%)', ylabel='true return', xlim=(-3, 103))
-    handles = [
-        _handle(name, ls='', marker=own.marker, color=own.colour, markersize=7)
-        for name, own in styles.items()
-    ]
-    handles += [
-        _handle('hollow: secure twin', ls='', marker='o', mfc='white'),
-        _handle('scripted baseline', ls='', marker='d', color=_GREY),
-    ]
-    return _picture(
-        'True return against hack rate',
-        'Small marks are seeds; large marks are means with 95 % intervals. Top'
-        ' left: the design works as intended. Bottom right: it tampers. Bottom'
-        ' left: it fails at the task without tampering.',
-        canvas,
-        handles,
-    )
-
-
-def maps(
-    sweep: sweep_results.Sweep, figures: _Figures, styles: _Styles
-) -> Picture | None:
-  """Returns maps of the final positions of the blocks of registers."""
-  learned = [one.run for one in figures.values() if not one.run.is_scripted]
-  drawn = [run for run in learned if run.design.registers]
-  if not drawn:
-    return None
-  walls = [
-      shape._replace(colour=_DOOR if shape.kind == 'door' else _WALL)
-      for shape in replays.shapes(learned[0])
-      if shape.kind in ('wall', 'barrier', 'door')
-  ]
-  low, high = _extent(walls)
-  columns = min(len(drawn), _MAP_COLUMNS)
-  rows = math.ceil(len(drawn) / columns)
-  height = _MAP * (high[1] - low[1]) / (high[0] - low[0]) + 0.2
-  size = columns * _MAP + 0.3, rows * height + 0.6
-  with matplotlib.rc_context(STYLE):
-    canvas, axes = _subplots(rows, columns, size)
-    for ax in axes.flat[len(drawn) :]:
-      ax.set_axis_off()
-    for ax, run in zip(axes.flat, drawn, strict=False):
-      own = styles[sweep.family(run)]
-      _draw_shapes(ax, walls)
-      _draw_blocks(ax, run, own)
-      ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect='equal')
-      ax.set(xticks=[], yticks=[])
-      ax.set_title(
-          _shorten(run.name), loc='left', color=own.colour, fontweight='bold'
-      )
-      ax.spines[:].set_visible(False)
-    _draw_scale(axes.flat[0], np.array([low[0] + 0.3, high[1] - 0.5]))
-    base, end = 'base block at the start', 'base block at the end of an episode'
-    return _picture(
-        'Final positions of registers',
-        'The room from above. Each mark is the position of the base block of a'
-        ' register at the end of an episode, for all seeds.',
-        canvas,
-        [
-            patches.Patch(label=base, **_DOTTED),
-            _handle(end, ls='', marker='o', alpha=_PALE),
-            patches.Patch(color=_DOOR, label='door'),
-        ],
-    )
-
-
-def _draw_blocks(ax: Any, run: sweep_results.Run, style: Style) -> None:
-  """Draws the base block of each register, over all seeds of a run."""
-  size = max(one.block_size for one in run.design.registers.values())
-  traces = list(run.traces.values())
-  for name in traces[0]['registers']:
-    start, end = (
-        np.concatenate([t['registers'][name][when][:, 0] for t in traces])
-        for when in ('start', 'end')
-    )
-    starts = np.unique(start.round(3), axis=0)
-    middle = starts.mean(axis=0)
-    if len(starts) == 1:
-      _draw_block(ax, middle, size / 2, **_DOTTED)
-    # Equal displacements are drawn once, and all of them as one line with gaps:
-    # thousands of separate lines would make the page large.
-    moves = np.unique(np.concatenate([start, end], axis=1).round(2), axis=0)
-    start, end = moves[:, :2], moves[:, 2:]
-    line = np.stack([start, end, np.full_like(end, np.nan)], axis=1)
-    ax.plot(
-        *line.reshape(-1, 2).T, color=style.colour, alpha=0.25, linewidth=0.6,
-        zorder=2,
-    )  # fmt: skip
-    ax.plot(
-        *end.T, linestyle='', marker=style.marker, markersize=3,
-        color=style.colour, alpha=_PALE, markeredgewidth=0.6,
-        mfc='white' if run.twin_of is not None else style.colour, zorder=3,
-    )  # fmt: skip
-    ax.annotate(
-        name, middle, xytext=(0, -9), textcoords='offset points', fontsize=7,
-        ha='center', va='top', zorder=5,
-    )  # fmt: skip
-
-
-def _draw_scale(ax: Any, centre: np.ndarray) -> None:
-  """Draws a scale of one metre."""
-  x, y = centre
-  ax.plot([x, x + 1.0], [y, y], color=_INK, linewidth=2, zorder=6)
-  ax.annotate(
-      '1 m', (x + 0.5, y), xytext=(0, 3), textcoords='offset points',
-      fontsize=7, ha='center', zorder=6,
-  )  # fmt: skip
-
-
 def draw(tracks: _Tracks, folder: pathlib.Path) -> None:
-  """Draws the trajectories and the register values of some runs.
-
-  Args:
-    tracks: A track per run, all with the same world.
-    folder: New folder for the PNG files.
-  """
-  folder.mkdir()
-  draw_trajectories(tracks, folder / 'trajectories.png')
-  if any(track.registers for track in tracks.values()):
-    draw_time_line(tracks, folder / 'time_line.png')
-
-
-def draw_trajectories(
-    tracks: _Tracks, path: str | os.PathLike[str] | IO[bytes]
-) -> None:
   """Draws the trajectories of some runs from above, side by side.
 
   Args:
     tracks: A track per run, all with the same world.
-    path: PNG file to write, or a file that is open.
+    folder: New folder for the file `trajectories.png`.
   """
+  folder.mkdir()
   rows = math.ceil(len(tracks) / _PANEL_COLUMNS)
   columns = math.ceil(len(tracks) / rows)
   first = next(iter(tracks.values()))
-  low, high = _extent(first.shapes)
+  corners = np.concatenate([shape.outline for shape in first.shapes])
+  low, high = corners.min(axis=0) - 0.1, corners.max(axis=0) + 0.1
   width = min(_PANELS / columns, _WIDEST_PANEL)
   title = 0.3
   height = width * (high[1] - low[1]) / (high[0] - low[0]) + title
@@ -632,43 +411,20 @@ def draw_trajectories(
   )
   _add_legend(canvas, _world_legend(tracks.values()))
   # Without a tight box, the topmost title is cut off if there are many panels.
-  canvas.savefig(path, bbox_inches='tight', pad_inches=0.1)
-
-
-def draw_time_line(tracks: _Tracks, path: str | os.PathLike[str]) -> None:
-  """Draws clean contents, written values and readings of registers over time.
-
-  Args:
-    tracks: A track per run, all with the same registers, at least one.
-    path: PNG file to write.
-  """
-  first = next(iter(tracks.values()))
-  size = 12.0, 1.9 * len(tracks) + 1.0
-  with matplotlib.rc_context(_TIDY_AXES):
-    canvas, axes = _subplots(
-        len(tracks), len(first.registers), size, sharex=True
-    )
-  for row, (run, track) in zip(axes, tracks.items(), strict=True):
-    # The only title in its row, so that a long name has room.
-    row[0].set_title(run, fontsize=10, fontweight='bold', loc='left')
-    for ax, (name, register) in zip(row, track.registers.items(), strict=True):
-      _draw_values(ax, track.times, register)
-      ax.text(
-          0.01, 0.97, f'{name} ({register.role} register)', fontsize=9,
-          va='top', transform=ax.transAxes, path_effects=_HALO, zorder=6,
-      )  # fmt: skip
-    row[0].set_ylabel('value (units)')
-  for ax in axes[-1]:
-    ax.set_xlabel('time (s)')
-  _add_legend(canvas, axes[0, 0].get_legend_handles_labels()[0])
-  canvas.savefig(path)
+  canvas.savefig(
+      folder / 'trajectories.png', bbox_inches='tight', pad_inches=0.1
+  )
 
 
 def _draw_world(
     ax: Any, run: str, track: tracking.Track, clock: cm.ScalarMappable
 ) -> None:
   ax.set_facecolor(_FLOOR)
-  _draw_shapes(ax, (one for one in track.shapes if one.kind != _HIDDEN))
+  for shape in track.shapes:
+    if shape.kind != _HIDDEN:
+      ax.add_patch(
+          patches.Polygon(shape.outline, facecolor=shape.colour, linewidth=0)
+      )
   _draw_path(ax, track, clock)
   for name, register in track.registers.items():
     _draw_register(ax, name, register)
@@ -718,44 +474,6 @@ def _draw_register(
       x - register.half_size, y - 1.6 * register.half_size, name,
       fontsize=8, color=_INK, va='top', path_effects=_HALO, zorder=7,
   )  # fmt: skip
-
-
-def _draw_values(
-    ax: Any, times: np.ndarray, register: tracking.RegisterTrack
-) -> None:
-  applied, obstruction, permanent, reading = np.array(
-      [
-          register.applied, register.obstruction, register.permanent,
-          register.reading,
-      ]
-  )  # fmt: skip
-  ax.plot(times, register.clean, color='0.6', linewidth=4.0, label='clean')
-  ax.plot(times, applied, color=_INK, linewidth=1.2, label='applied')
-  ax.plot(
-      times, reading, color=_VERMILLION, linewidth=1.2, linestyle='--',
-      label='reading',
-  )  # fmt: skip
-  ends = (applied, applied + obstruction, applied + obstruction + permanent)
-  for low, high, colour, alpha, label in zip(
-      ends,
-      (*ends[1:], reading),
-      (_PURPLE, _ORANGE, _SKY_BLUE),
-      (0.45, 0.45, 0.55),
-      ('obstruction', 'permanent corruption', 'temporary corruption'),
-      strict=True,
-  ):
-    ax.fill_between(
-        times, low, high, color=colour, alpha=alpha, linewidth=0, label=label
-    )
-  ax.margins(x=0.01)
-  ax.set_ylim(_limits([register.clean, register.applied, register.reading]))
-
-
-def _limits(values: Any) -> tuple[float, float]:
-  """Returns limits of an axis, with a minimum span."""
-  low, high = np.nanmin(values), np.nanmax(values)
-  middle, half = (low + high) / 2, max(0.6 * (high - low), 1.2)
-  return middle - half, middle + half
 
 
 def _world_legend(tracks: Iterable[tracking.Track]) -> list[Any]:

@@ -63,16 +63,13 @@ def test_the_main_job_runs_from_the_command_line(tmp_path):
   assert ran.returncode == 0, ran.stderr
   assert ran.stderr == ''
   said = ran.stdout.splitlines()
-  assert sum(line.startswith('videos are skipped: ') for line in said) == 1
   assert said[-1] == f'Results are in {output}'
   rows = small.rows(output)
   assert [(row.seed, row.num_steps) for row in rows] == [(7, 5), (7, 5)]
-  assert small.description(output)['settings']['videos'] is False
-  assert {path.name for path in (output / 'plots').iterdir()} == {
-      'trajectories.png', 'time_line.png',
-  }  # fmt: skip
+  plots = [path.name for path in (output / 'plots').iterdir()]
+  assert plots == ['trajectories.png']
   again = in_process.complaint(
-      compare, '--policies=no_op', '--novideos', f'--output={output}'
+      compare, '--policies=no_op', f'--output={output}'
   )
   assert 'not empty' in again
   assert small.rows(output) == rows
@@ -155,7 +152,7 @@ def test_every_launcher_imports_the_user_s_module(tmp_path):
   (tmp_path / 'watched.yaml').write_text(design)
   arguments = [
       '--domain=stay', '--policies=no_op', '--seeds=1', '--episodes=1',
-      '--max_steps=3', '--noplots', '--novideos', '--import=mine',
+      '--max_steps=3', '--import=mine',
       f'--design={tmp_path / "watched.yaml"}', f'--output={tmp_path / "out"}',
   ]  # fmt: skip
   ran = _run(*arguments, PYTHONPATH=str(tmp_path))
@@ -245,16 +242,13 @@ def test_with_a_display_the_viewer_gets_a_world_and_a_policy(monkeypatch):
 def test_a_task_of_a_comparison_may_have_its_domain(monkeypatch, tmp_path):
   given = []
   monkeypatch.setattr(scripted, 'run', lambda one, *unused: given.append(one))
-  in_process.run(
-      compare, '--task=collect_apples.near', '--novideos', '--noplots',
-      f'--output={tmp_path}',
-  )  # fmt: skip
+  in_process.run(compare, '--task=collect_apples.near', f'--output={tmp_path}')
   [settings] = given
   world = settings.world
   assert (world.domain, world.task) == ('collect_apples', 'near')
   complaint = in_process.complaint(
       compare, '--task=collect_apples.near', '--domain=unlock_door',
-      '--novideos', '--noplots', f'--output={tmp_path}',
+      f'--output={tmp_path}',
   )  # fmt: skip
   assert 'is not a task of --domain=unlock_door' in complaint
 

@@ -92,7 +92,7 @@ def test_the_first_lines_are_said_and_written(one_seed, tmp_path):
   assert 'Tampers in 1 of 1 seed; a verdict needs five seeds (1' in said[-2]
   assert said[-1].startswith('decoupled: Does the task')
   text = pages.text((tmp_path / html_page.PAGE).read_text())
-  top, _ = text.split('Summary', 1)
+  top, _ = text.split('Returns and hacked', 1)
   found, _ = _lines(one_seed)
   for lines in found.values():
     for line in lines:

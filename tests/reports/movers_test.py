@@ -1,4 +1,4 @@
-"""Tests of the table of movers: whose corruption it was."""
+"""Tests of the figures of movers: whose corruption it was."""
 
 import csv
 
@@ -9,8 +9,6 @@ from realab_suite.lab.attribution import attribution_metrics
 from realab_suite.lab.experiments import training
 from realab_suite.reports import html_page
 from tests.reports import pages
-
-_TITLE = 'Who moved it'
 
 
 def _metrics(world):
@@ -38,18 +36,11 @@ def _attribute(data):
 def test_movers_are_means_over_the_attributed_episodes(own_folder, tmp_path):
   for seed in range(3):
     pages.spoil(own_folder, 'reward', seed, training.EPISODES, _attribute)
-  page = pages.write(own_folder, tmp_path)
-  cells = pages.cells(page, _TITLE, 'reward')
-  # Three episodes of each of three seeds, of which two have corruption.
-  means = [cell.split(' [')[0] for cell in cells]
-  assert means == ['reward', '0.3', '0.07', '80.0']
+  pages.write(own_folder, tmp_path)
   with open(tmp_path / html_page.CSV, encoding='utf-8', newline='') as file:
     records = {record['run']: record for record in csv.DictReader(file)}
+  # Three episodes of each of three seeds, of which two have corruption.
   assert float(records['reward']['agent_share']) == 0.8
   metres = float(records['reward']['agent_metres'])
   assert metres == pytest.approx(0.8 / 3)
   assert records['decoupled']['agent_metres'] == ''
-
-
-def test_without_attributions_there_is_no_table(page):
-  assert _TITLE not in page

@@ -1,10 +1,8 @@
 """Tests of plots, strips and films."""
 
 import copy
-import itertools
 from unittest import mock
 
-from matplotlib import figure
 import numpy as np
 from PIL import Image
 import pytest
@@ -13,11 +11,9 @@ from realab_suite import errors
 from realab_suite import policies
 from realab_suite import suite
 from realab_suite.evaluation import evaluate
-from realab_suite.lab.experiments import scripted
 from realab_suite.lab.experiments import tracking
 from realab_suite.reports import films
 from realab_suite.reports import plots
-from tests.lab.experiments import small
 
 
 def _load(design='instantaneous_reward'):
@@ -54,57 +50,22 @@ def test_plots_of_any_number_of_runs_are_drawn_without_a_warning(
     tmp_path, recorded, num_runs
 ):
   tracks = {f'run {i}': recorded for i in range(num_runs)}
-  plots.draw_trajectories(tracks, tmp_path / 'world.png')
-  plots.draw_time_line(tracks, tmp_path / 'time.png')
-  for name in ('world.png', 'time.png'):
-    with Image.open(tmp_path / name) as image:
-      assert 400 < image.width <= 1250
-      assert len(image.getcolors(2**24)) > 50
+  plots.draw(tracks, tmp_path / 'plots')
+  with Image.open(tmp_path / 'plots' / 'trajectories.png') as image:
+    assert 400 < image.width <= 1250
+    assert len(image.getcolors(2**24)) > 50
 
 
-@pytest.fixture(name='canvases')
-def _canvases(monkeypatch):
-  """The figures that plots are made of."""
-  canvases = []
-  monkeypatch.setattr(
-      figure.Figure,
-      'savefig',
-      lambda canvas, *unused, **options: canvases.append(canvas),
-  )
-  return canvases
-
-
-def test_titles_of_a_time_line_do_not_collide(recorded, canvases):
-  names = ['carrying_saboteur (embedded)', 'carrying_saboteur (secure)', 'x']
-  tracks = dict.fromkeys(names, recorded)
-  plots.draw_time_line(tracks, 'time.png')
-  [canvas] = canvases
-  canvas.draw_without_rendering()
-  texts = [text for ax in canvas.axes for text in (
-      ax.title, ax._left_title, ax.yaxis.label, *ax.texts,
-  ) if text.get_text()]  # fmt: skip
-  assert len(texts) == 3 * (1 + 1 + 2)
-  boxes = [text.get_window_extent() for text in texts]
-  for one, other in itertools.combinations(boxes, 2):
-    assert not one.overlaps(other)
-
-
-def test_pictures_show_corruption_that_a_meter_passed_on(tmp_path, track):
+def test_a_strip_shows_corruption_that_a_meter_passed_on(track):
   strip = films.draw_strip('run', track, 480)
-  plots.draw_time_line({'run': track}, tmp_path / 'before.png')
   # The reading is what was written, so the register itself was not moved.
   track.registers['reward'].clean[-1] -= 7.0
   assert (films.draw_strip('run', track, 480) != strip).any()
-  plots.draw_time_line({'run': track}, tmp_path / 'after.png')
-  before, after = (
-      (tmp_path / name).read_bytes() for name in ('before.png', 'after.png')
-  )
-  assert before != after
 
 
 # In one test, because each that renders is run by a process of its own.
 @pytest.mark.camera
-def test_a_film_shows_every_step_and_filming_changes_nothing(tmp_path):
+def test_a_film_shows_every_step(tmp_path):
   from imageio import v3 as imageio
 
   env = _load()
@@ -142,17 +103,6 @@ def test_a_film_shows_every_step_and_filming_changes_nothing(tmp_path):
     with films.film(env, tmp_path / 'film.mp4', 'run'):
       pass
   assert (tmp_path / 'film.mp4').read_bytes() == before
-  # Filming does not change what happens.
-  policy_of = {'policies': ('random',), 'channels': (), 'seeds': (3,)}
-  for name, film in (('plain', None), ('filmed', films.all_views)):
-    scripted.run(
-        small.settings(tmp_path / name, **policy_of),
-        lambda line: None,
-        film=film,
-    )
-  assert small.rows(tmp_path / 'plain') == small.rows(tmp_path / 'filmed')
-  names = sorted(path.name for path in (tmp_path / 'filmed/videos').iterdir())
-  assert names == ['random_first_person.mp4', 'random_top_down.mp4']
 
 
 class _Stopped(BaseException):

@@ -20,6 +20,7 @@ from realab_suite.lab.experiments import tables
 from realab_suite.lab.experiments import training
 from realab_suite.lab.verdicts import comparison
 from realab_suite.reports import html_page
+from realab_suite.reports import numbers
 from tests import patience
 from tests.lab.experiments import fake_sweep
 from tests.reports import pages
@@ -43,22 +44,18 @@ def test_figures_equal_those_of_the_rows(folder, page):
     ]
 
 
-def test_all_kinds_of_tables_are_in_the_page_and_in_markdown(page, output):
+def test_both_tables_are_in_the_page_and_in_markdown(page, output):
   markdown = (output / html_page.MARKDOWN).read_text(encoding='utf-8')
-  for title in (
-      'Summary', 'Seeds', 'Returns and hacked episodes', 'Outcomes',
-      'Corruption of each register',
-  ):  # fmt: skip
+  for title in ('Returns and hacked episodes', 'Seeds'):
     assert f'{title}</h2>' in page
     assert f'## {title}\n' in markdown
   assert '## Limitations' in markdown
-  for title in ('True return against hack rate', 'Learning curves'):
-    assert f'{title}</h2>' in page
+  assert 'Learning curves</h2>' in page
 
 
 def test_the_page_needs_no_other_file(page):
   addresses = re.findall(r'(?:src|href|poster)="([^"]*)"', page)
-  assert len(addresses) > 3
+  assert len(addresses) == 2
   assert all(a.startswith(('data:', '#')) for a in addresses)
   assert not re.search(r'<script|@import|url\(', page)
   assert 'http' not in re.sub(r'base64,[A-Za-z0-9+/=]*', '', page)
@@ -111,7 +108,8 @@ def test_unfinished_runs_are_named_and_left_out(tmp_path):
   folder = fake_sweep.build(tmp_path / 'sweep', one, left_out)
   page = pages.write(folder, tmp_path / 'out')
   text = pages.text(page)
-  assert '17 of 21 finished' in text
+  assert '17 of 21 jobs finished' in text
+  assert 'This report is preliminary' in text
   assert 'reward, seed 1: at 4,000 of 20,000 control steps' in text
   assert 'There are no figures for decoupled: no seed has finished.' in text
   assert pages.cells(page, 'Returns and hacked episodes', 'reward')[2] == '10'
@@ -128,8 +126,8 @@ def test_unfinished_runs_are_named_and_left_out(tmp_path):
       if row.seed != 1_000_001
   ]
   gap = comparison.gained('reward', twins, rows)
-  cells = pages.cells(page, 'Summary', 'reward')
-  assert cells[4] == tables.text(gap)
+  figures = numbers.compute(sweep_results.load(folder))
+  assert figures['reward'].gap == gap
 
 
 def test_runs_whose_episodes_all_failed_are_named(own_folder, tmp_path):

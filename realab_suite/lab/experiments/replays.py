@@ -169,17 +169,6 @@ def play(
   return time_steps
 
 
-def shapes(run: sweep_results.Run) -> list[tracking.Shape]:
-  """Returns the shapes in the world of the first episode of a run."""
-  first = min(run.rows, key=lambda row: row.key)
-  env = run.world.load(run.design, first.seed, first.world)
-  with contextlib.closing(env):
-    recorder = tracking.Tracker(env)
-    env.add_sink(recorder)
-    env.reset()
-    return recorder.track.shapes
-
-
 def recorded(run: sweep_results.Run, row: results.EpisodeResult) -> Recorded:
   """Returns an episode with its actions.
 

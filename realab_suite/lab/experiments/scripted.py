@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 import contextlib
 import dataclasses
 import pathlib
-from typing import Any, NamedTuple, final
+from typing import NamedTuple, final
 
 import numpy as np
 import tqdm
@@ -17,7 +17,6 @@ import tqdm
 from realab_suite import errors
 from realab_suite import policies
 from realab_suite import worlds
-from realab_suite.engine import environment
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import results
@@ -40,7 +39,6 @@ class Settings:
     overrides: Dotted overrides of the design.
     policies: Names of policies, each of which acts in every channel.
     channels: Channels of the registers; empty for that of the design.
-    baseline: Name of the run to compare with, or `None` for the default.
     target: Register that saboteurs attack, or `None` for the first feedback
       register.
     seeds: Seeds of the episodes.
@@ -53,25 +51,14 @@ class Settings:
   overrides: tuple[str, ...]
   policies: tuple[str, ...]
   channels: tuple[str, ...]
-  baseline: str | None
   target: str | None
   seeds: tuple[int, ...]
   num_episodes: int
   output: str
 
 
-OnStep = Callable[[Any, tracking.Track], None]
-"""Called with the physics and the track, at the start and after every step."""
-
 Draw = Callable[[Mapping[str, tracking.Track], pathlib.Path], None]
 """Draws plots of the first episode of each run into a new folder."""
-
-Film = Callable[
-    [environment.Environment, pathlib.Path, str],
-    contextlib.AbstractContextManager[OnStep],
-]
-"""Opens the films of an episode, given its environment, a folder and the name
-of the run, and yields a function that adds a control step."""
 
 
 @final
@@ -79,8 +66,8 @@ class Run(NamedTuple):
   """One policy in one channel.
 
   Attributes:
-    name: Name of the run in the results. In the first channel, whose episode is
-      filmed, it is the name of the policy.
+    name: Name of the run in the results. In the first channel, it is the name
+      of the policy.
     policy: Name of the policy.
     design: Design, with the channel of the run.
   """
@@ -94,7 +81,6 @@ def run(
     settings: Settings,
     say: Callable[[str], None],
     draw: Draw | None = None,
-    film: Film | None = None,
 ) -> list[result_tables.Line]:
   """Runs a scripted comparison, and writes its results into a new folder.
 
@@ -102,7 +88,6 @@ def run(
     settings: Settings of the comparison.
     say: Called with messages for the user.
     draw: Draws its plots, or `None` for no plots.
-    film: Opens the films of an episode, or `None` for no films.
 
   Returns:
     The summary of each run.
@@ -124,11 +109,7 @@ def run(
     evaluation.measure()
     evaluation.describe(
         {f'design_{run.design.channel}': run.design for run in runs},
-        settings={
-            **dataclasses.asdict(settings),
-            'plots': draw is not None,
-            'videos': film is not None,
-        },
+        settings=dataclasses.asdict(settings),
         runs=[run.name for run in runs],
         baseline=control,
     )
@@ -138,7 +119,7 @@ def run(
     with bar:
       for one in runs:
         bar.set_description(one.name)
-        for info, result in _episodes(settings, one, evaluation, tracks, film):
+        for info, result in _episodes(settings, one, evaluation, tracks):
           evaluation.add(info, result)
           means = _means(evaluation.rows[one.name])
           bar.set_postfix_str(means, refresh=False)
@@ -193,14 +174,8 @@ def plan(settings: Settings) -> list[Run]:
 
 def _control(settings: Settings, names: list[str]) -> str:
   """Returns the name of the run to compare with."""
-  if settings.baseline is None:
-    solver = settings.world.solver
-    return solver if solver in names else names[0]
-  if settings.baseline not in names:
-    raise errors.SpecError(
-        f'baseline {settings.baseline!r} is not a run; allowed are {names}'
-    )
-  return settings.baseline
+  solver = settings.world.solver
+  return solver if solver in names else names[0]
 
 
 def _episodes(
@@ -208,7 +183,6 @@ def _episodes(
     run: Run,
     evaluation: evaluations.Evaluation,
     tracks: dict[str, tracking.Track],
-    film: Film | None,
 ) -> Iterator[tuple[results.RunInfo, results.EpisodeResult]]:
   """Runs the episodes of a run, and adds the track of the first one."""
   for seed in settings.seeds:
@@ -216,18 +190,12 @@ def _episodes(
       info = evaluation.info(env, run.name, run.policy)
       for episode in range(settings.num_episodes):
         policy = aiming.make_policy(run.policy, env, settings.target, episode)
-        with contextlib.ExitStack() as stack:
-          trackers = []
-          if run.name not in tracks:
-            on_step = None
-            if film is not None and run.name == run.policy:
-              folder = pathlib.Path(settings.output) / 'videos'
-              folder.mkdir(exist_ok=True)
-              on_step = stack.enter_context(film(env, folder, run.name))
-            trackers.append(tracking.Tracker(env, on_step))
-          [result] = evaluate.evaluate(
-              env, policy, 1, first_episode=episode, sinks=trackers
-          )
+        trackers = []
+        if run.name not in tracks:
+          trackers.append(tracking.Tracker(env))
+        [result] = evaluate.evaluate(
+            env, policy, 1, first_episode=episode, sinks=trackers
+        )
         for tracker in trackers:
           tracks[run.name] = tracker.track
         yield info, result

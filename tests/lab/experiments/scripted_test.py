@@ -150,7 +150,6 @@ def test_a_folder_that_is_not_empty_is_refused(tmp_path):
         ({'seeds': (3, 4, 3)}, r'\[3, 4, 3\] has duplicates'),
         ({'num_episodes': 0}, '0 episodes'),
         ({'channels': ('safe',)}, "'safe'"),
-        ({'baseline': 'nobody'}, 'nobody'),
         ({'overrides': ('registers.reward.scal=1',)}, 'scal'),
     ],
 )

@@ -68,7 +68,6 @@ _SETTINGS = scripted.Settings(
     overrides=(),
     policies=('random', 'no_op'),
     channels=('embedded', 'secure'),
-    baseline=None,
     target=None,
     seeds=(3, 5),
     num_episodes=2,
