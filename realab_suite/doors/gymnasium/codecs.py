@@ -16,7 +16,6 @@ _LARGEST = float(np.finfo(np.float32).max)
 
 Observation = dict[str, np.ndarray] | np.ndarray
 DType = Literal['float32', 'float64']
-Classes = Literal['all', 'present']
 
 
 def key_of(name: str) -> str:
@@ -32,8 +31,7 @@ class ObservationCodec:
 
   - Integers with up to `appearance.CAPACITY` values are classes:
     `MultiDiscrete`, from 0. Gymnasium and Stable-Baselines3 encode them as
-    one-hot. With `classes='present'`, classes of objects are those that their
-    spec lists, and their values are the positions in this list.
+    one-hot.
   - Images are `Box` of uint8.
   - Other numbers are `Box` of floats, with at least one axis.
 
@@ -47,7 +45,6 @@ class ObservationCodec:
       observation_spec: Mapping[str, specs.Array],
       dtype: DType = 'float32',
       flat: bool = False,
-      classes: Classes = 'all',
   ) -> None:
     """Initializes the codec.
 
@@ -55,21 +52,12 @@ class ObservationCodec:
       observation_spec: Observation spec of one world.
       dtype: Type of the floats.
       flat: True for flat observations.
-      classes: Classes of objects: `'all'` that can be registered, or
-        `'present'` for those that their spec lists.
     """
     self._dtype = np.dtype(dtype)
     self._flat = flat
     self._names = {key_of(name): name for name in sorted(observation_spec)}
-    # Codes that observations contain as their positions in these arrays.
-    self._codes = {
-        key: np.unique(spec.codes)
-        for key, name in self._names.items()
-        if classes == 'present'
-        and isinstance(spec := observation_spec[name], appearance.ClassArray)
-    }
     self._parts = {
-        key: _part(observation_spec[name], self._dtype, self._codes.get(key))
+        key: _part(observation_spec[name], self._dtype)
         for key, name in self._names.items()
     }
     self._lows = {
@@ -89,10 +77,6 @@ class ObservationCodec:
     Args:
       observation: Arrays by name, each `(*lead, *spec.shape)`.
       lead: `()` for one world, `(worlds,)` for a batch.
-
-    Raises:
-      SpecError: If a class is not in the list of its spec, and observations
-        have no other classes.
     """
     encoded = {
         key: self._encode(key, observation[name], lead)
@@ -110,23 +94,9 @@ class ObservationCodec:
       self, key: str, value: np.ndarray, lead: tuple[int, ...]
   ) -> np.ndarray:
     part = self._parts[key]
-    if key in self._codes:
-      value = self._positions(key, value)
     low = self._lows.get(key, 0)
     shifted = value - low if low else value
     return np.array(shifted, part.dtype).reshape(*lead, *(part.shape or ()))
-
-  def _positions(self, key: str, value: np.ndarray) -> np.ndarray:
-    """Returns the positions of class codes in the list of their spec."""
-    codes = self._codes[key]
-    found = np.searchsorted(codes, value)
-    is_unlisted = codes.take(found, mode='clip') != value
-    if is_unlisted.any():
-      raise errors.SpecError(
-          f'{self._names[key]}: class {value[is_unlisted][0]}; with'
-          f" classes='present', allowed are those of its spec: {codes.tolist()}"
-      )
-    return found
 
   def _vector(self, key: str, value: np.ndarray) -> np.ndarray:
     part = self._parts[key]
@@ -137,9 +107,7 @@ class ObservationCodec:
     return one_hot
 
 
-def _part(
-    spec: specs.Array, dtype: np.dtype, codes: np.ndarray | None
-) -> spaces.Space[Any]:
+def _part(spec: specs.Array, dtype: np.dtype) -> spaces.Space[Any]:
   """Returns the space of one entry of an observation."""
   kind = np.dtype(spec.dtype).kind
   shape = spec.shape or (1,)
@@ -148,23 +116,17 @@ def _part(
   high = spec.maximum if is_bounded else _LARGEST
   if spec.dtype == np.uint8 and len(shape) == 3:
     return spaces.Box(0, 255, shape, np.uint8)
-  if codes is not None:
-    return _classes(shape, len(codes))
   if kind in 'iu' and is_bounded:
     num_classes = int(np.max(high)) - int(np.min(low)) + 1
     if num_classes <= appearance.CAPACITY:
-      return _classes(shape, num_classes)
+      # Of 16 bits: Gymnasium's flattening then keeps 32-bit floats, and sums of
+      # the numbers of classes, as in Stable-Baselines3, do not overflow.
+      return spaces.MultiDiscrete(np.full(shape, num_classes), dtype=np.int16)
   low, high = (
       np.broadcast_to(np.clip(one, -_LARGEST, _LARGEST), shape).astype(dtype)
       for one in (low, high)
   )
   return spaces.Box(low, high, shape, dtype.type)
-
-
-def _classes(shape: tuple[int, ...], number: int) -> spaces.Space[Any]:
-  # Of 16 bits: Gymnasium's flattening then keeps 32-bit floats, and sums of the
-  # numbers of classes, as in Stable-Baselines3, do not overflow.
-  return spaces.MultiDiscrete(np.full(shape, number), dtype=np.int16)
 
 
 def _flat_space(

@@ -1,14 +1,11 @@
 """Spaces, conversions and pictures: what one world and a batch share."""
 
 from collections.abc import Collection, Mapping
-from typing import Annotated, Any, Literal, final
+from typing import Any, Literal, final
 
 from dm_control import composer
-import numpy as np
-import pydantic
 
 from realab_suite import errors
-from realab_suite.config import integers
 from realab_suite.config import validation
 from realab_suite.doors.gymnasium import codecs
 from realab_suite.engine import agent_view
@@ -17,30 +14,6 @@ from realab_suite.engine import arguments
 _DEFAULT = 'top_down'
 # MuJoCo's free camera.
 _FREE = -1
-
-
-def _integer(given: Any) -> Any:
-  """Returns an integer of NumPy as one of Python."""
-  return int(given) if integers.is_integer(given) else given
-
-
-def _flag(given: Any) -> Any:
-  """Returns 0, 1 and Booleans of NumPy as Booleans of Python."""
-  is_number = integers.is_integer(given) and given in (0, 1)
-  return bool(given) if is_number or isinstance(given, np.bool_) else given
-
-
-def _dtype_name(given: Any) -> Any:
-  """Returns the name of a type of NumPy, such as `np.dtype('float64')`."""
-  if isinstance(given, np.dtype):
-    return given.name
-  is_scalar = isinstance(given, type) and issubclass(given, np.generic)
-  return given.__name__ if is_scalar else given
-
-
-_Integer = Annotated[int, pydantic.BeforeValidator(_integer)]
-_Flag = Annotated[bool, pydantic.BeforeValidator(_flag)]
-_DType = Annotated[codecs.DType, pydantic.BeforeValidator(_dtype_name)]
 
 
 @final
@@ -52,8 +25,6 @@ class Options(validation.Model):
       for a reward of 0.0.
     dtype: Type of floats in observations and actions.
     flat: True for observations that are one vector for each world.
-    classes: Classes of objects in observations: `'all'` that can be registered,
-      or `'present'` for those that the spec of the world lists.
     render_mode: `'rgb_array'`, or `None`. Frames are for people.
     camera_name: Camera of the frames; `None` for `'top_down'`, or a free camera
       in a single world without it.
@@ -63,14 +34,13 @@ class Options(validation.Model):
 
   # `codecs.reward_key` knows which registers there are.
   reward_register: Any = None
-  dtype: _DType = 'float32'
-  flat: _Flag = False
-  classes: codecs.Classes = 'all'
+  dtype: codecs.DType = 'float32'
+  flat: bool = False
   # Not `| None`, which the error message would leave out.
   render_mode: Literal['rgb_array', None] = None
   camera_name: str | None = None
-  height: _Integer = 240
-  width: _Integer = 320
+  height: int = 240
+  width: int = 320
 
 
 def check_names(given: Collection[str], allowed: Collection[str]) -> None:
@@ -125,9 +95,7 @@ class Interface:
     chosen = validation.validate(Options, options, 'options')
     spec = view.observation_spec()
     self.reward_key = codecs.reward_key(chosen.reward_register, spec)
-    self.observations = codecs.ObservationCodec(
-        spec, chosen.dtype, chosen.flat, chosen.classes
-    )
+    self.observations = codecs.ObservationCodec(spec, chosen.dtype, chosen.flat)
     self.actions = codecs.ActionCodec(view.action_spec(), chosen.dtype)
     self.metadata = {
         'render_modes': ['rgb_array'],

@@ -16,7 +16,6 @@ from gymnasium.utils import env_checker
 from realab_suite import errors
 from realab_suite import policies
 from realab_suite import suite
-from realab_suite.doors.gymnasium import codecs
 from realab_suite.doors.gymnasium import evaluation
 from realab_suite.doors.gymnasium import registration
 from realab_suite.doors.gymnasium import single
@@ -75,9 +74,7 @@ def test_the_checker_of_gymnasium_has_no_warnings(name):
 
 
 def test_the_checker_has_no_warnings_about_flat_observations():
-  env = _make(
-      flat=True, classes='present', reward_register='reward', **_DISCRETE
-  )
+  env = _make(flat=True, reward_register='reward', **_DISCRETE)
   env_checker.check_env(env, skip_render_check=True)
 
 
@@ -109,46 +106,18 @@ def test_a_world_contains_no_class_but_those_of_its_spec():
   # All worlds list the first 11.
   codes = np.array([*range(11), 14, 17, 18])
   name = 'realab/SupervisedRoom-standard-InstantaneousReward-v1'
-  options = {'environment_kwargs': {'max_steps': 100}}
-  usual, compact = (
-      _make(name, classes=classes, **options) for classes in ('all', 'present')
-  )
-  key = 'senses_ray_classes'
-  assert set(compact.observation_space[key].nvec) == {len(codes)}
-  same = {k: space for k, space in usual.observation_space.items() if k != key}
-  rest = {
-      k: space for k, space in compact.observation_space.items() if k != key
-  }
-  assert rest == same
-  compact.action_space.seed(3)
-  expected, found = (env.reset(seed=5)[0] for env in (usual, compact))
+  env = _make(name, environment_kwargs={'max_steps': 100})
+  env.action_space.seed(3)
+  observation, _ = env.reset(seed=5)
   for _ in range(100):
-    assert found in compact.observation_space
-    np.testing.assert_array_equal(codes[found.pop(key)], expected.pop(key))
-    _assert_same(found, expected)
-    action = compact.action_space.sample()
-    expected, found = (env.step(action)[0] for env in (usual, compact))
+    assert np.isin(observation['senses_ray_classes'], codes).all()
+    observation, *_ = env.step(env.action_space.sample())
 
 
-def test_a_class_that_its_spec_does_not_list_is_refused():
-  spec = {'rays': appearance.ClassArray((2, 3), (0, 31, 1))}
-  codec = codecs.ObservationCodec(spec, classes='present')
-  listed = {'rays': np.array([[0, 1, 31], [1, 1, 0]], np.int32)}
-  found = codec.encode(listed)['rays']
-  assert found.tolist() == [[0, 1, 2], [1, 1, 0]]
-  for code in (7, 32, -1):
-    unlisted = {'rays': np.full((2, 3), code, np.int32)}
-    with pytest.raises(
-        errors.SpecError, match=rf'^rays: class {code}; .*\[0, 1, 31\]$'
-    ):
-      codec.encode(unlisted)
-
-
-@pytest.mark.parametrize(('classes', 'size'), [('all', 1067), ('present', 395)])
-def test_a_flat_observation_is_that_of_gymnasiums_wrapper(classes, size):
-  flat = _make(flat=True, classes=classes)
-  wrapped = gym.wrappers.FlattenObservation(_make(classes=classes))
-  assert flat.observation_space.shape == (size,)
+def test_a_flat_observation_is_that_of_gymnasiums_wrapper():
+  flat = _make(flat=True)
+  wrapped = gym.wrappers.FlattenObservation(_make())
+  assert flat.observation_space.shape == (1067,)
   assert flat.observation_space == wrapped.observation_space
   for env in (flat, wrapped):
     env.action_space.seed(2)
@@ -219,7 +188,6 @@ def test_actions_of_another_shape_or_type_are_refused(action):
         ({'render_mode': 'human'}, "must be 'rgb_array' or None"),
         ({'flat': 'yes'}, "flat: must be .*'yes'"),
         ({'camera_name': 'nowhere'}, 'camera'),
-        ({'classes': 'some'}, "classes: must be 'all' or 'present'"),
     ],
 )
 def test_wrong_options_are_refused(options, message):
@@ -308,18 +276,12 @@ def _assert_same(found: Any, expected: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ('mode', 'flat', 'classes'),
-    [
-        ('NextStep', True, 'all'),
-        ('SameStep', False, 'present'),
-        ('Disabled', False, 'all'),
-    ],
+    ('mode', 'flat'),
+    [('NextStep', True), ('SameStep', False), ('Disabled', False)],
 )
-def test_a_batch_does_what_gymnasiums_vector_of_its_worlds_does(
-    mode, flat, classes
-):
-  envs = _make_vec(mode, flat=flat, classes=classes)
-  sync = _sync(mode, flat=flat, classes=classes)
+def test_a_batch_does_what_gymnasiums_vector_of_its_worlds_does(mode, flat):
+  envs = _make_vec(mode, flat=flat)
+  sync = _sync(mode, flat=flat)
   assert envs.single_observation_space == sync.single_observation_space
   assert envs.observation_space == sync.observation_space
   assert envs.action_space == sync.action_space
