@@ -30,7 +30,6 @@ _SHARED = flags.FlagValues()
 _Run = TypeVar('_Run')
 
 _define_boolean = functools.partial(flags.DEFINE_boolean, flag_values=_SHARED)
-_define_float = functools.partial(flags.DEFINE_float, flag_values=_SHARED)
 _define_integer = functools.partial(flags.DEFINE_integer, flag_values=_SHARED)
 _define_list = functools.partial(flags.DEFINE_list, flag_values=_SHARED)
 _define_multi_string = functools.partial(
@@ -165,35 +164,6 @@ TENSORBOARD = _define_boolean(
     False,
     'Also writes learning curves for TensorBoard.',
 )
-
-# Pages for a person.
-PORT = _define_integer(
-    'port',
-    0,
-    'Port of the page; 0 for a free one.',
-    0,
-    65535,
-)
-HOST = _define_string(
-    'host',
-    '127.0.0.1',
-    'Address to listen at. The default is reached from this machine only;'
-    ' connections are not encrypted.',
-)
-flags.register_validator(
-    'host',
-    bool,
-    message='allowed are addresses, such as 127.0.0.1',
-    flag_values=_SHARED,
-)
-RATE = _define_float(
-    'rate',
-    10.0,
-    'Control steps per second; 10 is real time.',
-    0.1,
-    1000.0,
-)
-PAGE = (PORT, HOST, RATE, EPISODES)
 
 _SHARED.mark_as_parsed()
 # The launcher that takes a flag is the one whose --help shows it.

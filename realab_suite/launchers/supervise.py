@@ -22,7 +22,7 @@ from realab_suite.launchers import renderers
 flags.take(
     *flags.WORLD,
     flags.TARGET,
-    *flags.PAGE,
+    flags.EPISODES,
     flags.IMPORT,
     flags.OUTPUT,
     flags.POLICY,
@@ -77,10 +77,9 @@ def main() -> None:
     stack.enter_context(contextlib.closing(env))
     name = flags.POLICY.value
     policy = aiming.make_policy(name, env, flags.TARGET.value, 0)
-    host, port = flags.HOST.value, flags.PORT.value
-    server = stack.enter_context(servers.PageServer('supervise', host, port))
+    server = stack.enter_context(servers.PageServer())
     folder = storage.new_folder(output)
-    supervision = supervised.Supervision(env, server, folder, flags.RATE.value)
+    supervision = supervised.Supervision(env, server, folder)
     stack.callback(supervision.close)
     program.say(f'Open this address in a browser: {server.url}')
     num_episodes = flags.EPISODES.value or 1

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from realab_suite.config import loading
-from realab_suite.doors.browser import person
 from realab_suite.feedback import providers
 from realab_suite.feedback import specs
 from tests.config import refusals
@@ -226,12 +225,11 @@ def test_it_pays_what_a_provider_pays_less_the_fines(name: str):
 
 
 def test_it_needs_what_the_provider_that_it_pays_for_needs():
-  corrections: Any = {
-      'kind': person.KIND, 'asks': 'correction', 'writes': ('r',),
-      'answers': 'simulated',
+  shown: Any = {
+      'kind': 'demonstration', 'policy': 'apple_seeker', 'writes': ('r',),
   }  # fmt: skip
   provider = _make(
-      pays=corrections, reads=('moved', 'budget'), writes=('r', 'budget')
+      pays=shown, reads=('moved', 'budget'), writes=('r', 'budget')
   )
   alone = provider.pays
   assert provider.required_senses == alone.required_senses != ()

@@ -37,7 +37,7 @@ class Person(base.Provider):
       question is asked after the later one.
     waits: True if the episode waits for the answer.
     action_set: Name and version of the actions of queries and corrections.
-    answers: Source of the answers: `simulated`, `recorded` or `live`.
+    answers: Source of the answers: `live` or `recorded`.
     options: Keyword arguments of the source.
   """
 
@@ -49,9 +49,7 @@ class Person(base.Provider):
   action_set: Annotated[str, option_types.NameIn(action_sets.ACTION_SETS)] = (
       action_sets.DMLAB_LIKE.key
   )
-  answers: Annotated[str, option_types.NameIn(answer_sources.ANSWERS)] = (
-      'simulated'
-  )
+  answers: Annotated[str, option_types.NameIn(answer_sources.ANSWERS)] = 'live'
   options: Annotated[
       dict[str, Any], option_types.OptionsOf(answer_sources.ANSWERS, 'answers')
   ] = pydantic.Field(default_factory=dict)
@@ -75,16 +73,8 @@ class Person(base.Provider):
       ) from error
 
   @property
-  def required_senses(self) -> tuple[str, ...]:
-    return self.source.required_senses
-
-  @property
-  def privileged_senses(self) -> tuple[str, ...]:
-    return self.source.privileged_senses
-
-  @property
   def is_repeatable(self) -> bool:
-    return self.source.is_repeatable
+    return False  # A person cannot be asked twice.
 
   def check(self, design: Any) -> None:
     wanted = 0 if self.asks == answer_sources.CORRECTION else 1
@@ -100,18 +90,9 @@ class Person(base.Provider):
     actions = action_sets.ACTION_SETS.get(self.action_set)
     if design.action_set is not None:
       policies.check_action_set(actions, design, self.kind)
-    known = self.source.action_set
-    if known is not None and known != actions:
-      raise ValueError(
-          f'source of answers {self.answers!r} judges action set'
-          f' {known.key!r}; allowed is {self.action_set!r}'
-      )
 
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
-    return (
-        np.zeros(batch_shape, int),  # Steps of this provider.
-        self.source.initial_state(batch_shape),
-    )
+    return np.zeros(batch_shape, int)  # Steps of this provider.
 
   def step(
       self,
@@ -121,30 +102,18 @@ class Person(base.Provider):
       key: np.ndarray,
       state: Any,
   ) -> tuple[base.Writes, Any]:
-    count, inner = state
-    count = np.where(episode_start, 1, count + 1)
-    place, is_end = queries.place_of(count, self.clip)
-    is_asked = (
-        is_end
-        if self.asks == answer_sources.COMPARISON
-        else np.ones(np.shape(count), bool)
-    )
+    del observation
+    count = np.where(episode_start, 1, state + 1)
+    is_asked = np.ones(np.shape(count), bool)
+    if self.asks == answer_sources.COMPARISON:
+      _, is_asked = queries.place_of(count, self.clip)
     num_actions = len(action_sets.ACTION_SETS.get(self.action_set))
     query = None
     if self.reads:
       query = queries.index(readings[self.reads[0]], num_actions)
-    values, speaks, inner = self.source.answer(
+    values, speaks = self.source.answer(
         answer_sources.Question(
-            self.asks,
-            observation,
-            query,
-            np.asarray(place >= self.clip, int),
-            np.asarray(is_asked),
-            self.waits,
-            np.asarray(count),
-            np.asarray(episode_start),
-            key,
-        ),
-        inner,
+            self.asks, query, np.asarray(is_asked), self.waits, key
+        )
     )
-    return {self.writes[0]: (np.asarray(values), speaks)}, (count, inner)
+    return {self.writes[0]: (np.asarray(values), speaks)}, count

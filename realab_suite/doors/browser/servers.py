@@ -21,9 +21,7 @@ from websockets.sync import server as websocket_server
 
 from realab_suite import errors
 
-LOCAL = '127.0.0.1'
-"""Address that only programs on this machine reach."""
-
+_LOCAL = '127.0.0.1'  # Only programs on this machine reach it.
 _POLICY = (
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline';"
     " img-src blob: data:; connect-src 'self' ws:; base-uri 'none';"
@@ -45,47 +43,27 @@ class PageServer:
   The page that connected last is the one that is served.
   """
 
-  def __init__(self, page: str, host: str = LOCAL, port: int = 0) -> None:
-    """Starts serving.
-
-    Args:
-      page: Name of a file in `pages`, without `.html`.
-      host: Address to listen at.
-      port: Port to listen at; 0 for a free one.
-
-    Raises:
-      SpecError: If the address cannot be used.
-    """
-    folder = resources.files('realab_suite.doors.browser') / 'pages'
-    head, body = (
-        (folder / f'{name}.html').read_text(encoding='utf-8')
-        for name in ('head', page)
-    )
-    head = head.replace('@TITLE@', page.capitalize())
-    self._page = (head + body).encode()
+  def __init__(self) -> None:
+    """Starts serving at a free port of this machine."""
+    folder = resources.files('realab_suite.doors.browser')
+    self._page = (folder / 'pages' / 'supervise.html').read_bytes()
     self._token = secrets.token_urlsafe(16)
     self._connection: websocket_server.ServerConnection | None = None
     self._lock = threading.Lock()  # Of the connection and its event.
     self._is_connected = threading.Event()
     self._is_closed = False
     self._messages: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
-    try:
-      self._server = websocket_server.serve(
-          self._handle,
-          host,
-          port,
-          process_request=self._answer,
-          compression=None,
-          max_size=_LARGEST_MESSAGE,
-          server_header=None,
-      )
-    except OSError as error:
-      raise errors.SpecError(
-          f'cannot serve a page at {host}:{port}: {error.strerror}; allowed is'
-          ' an address of this machine and a free port'
-      ) from error
+    self._server = websocket_server.serve(
+        self._handle,
+        _LOCAL,
+        0,
+        process_request=self._answer,
+        compression=None,
+        max_size=_LARGEST_MESSAGE,
+        server_header=None,
+    )
     port = self._server.socket.getsockname()[1]
-    self.url = f'http://{host}:{port}/?token={self._token}'
+    self.url = f'http://{_LOCAL}:{port}/?token={self._token}'
     self._thread = threading.Thread(
         target=self._server.serve_forever, name='page server', daemon=True
     )

@@ -32,8 +32,6 @@ ANSWERS = 'answers.jsonl'
 
 # Longest wait for a message, in seconds.
 _PATIENCE = 0.2
-# Upper bound of the times of a page, in ms since 1970.
-_LATEST = 1e15
 # Numbers of the pictures in the page: the view, and the earlier clip.
 _VIEW, _FIRST_CLIP = 0, 1
 _RUN = 'supervised'
@@ -54,7 +52,7 @@ class Supervision:
       env: environment.Environment,
       server: servers.PageServer,
       folder: pathlib.Path,
-      rate: float,
+      rate: float = 10.0,
   ) -> None:
     """Connects the persons of a design to a page.
 
@@ -63,7 +61,7 @@ class Supervision:
         source `live`.
       server: Server of the page `supervise`.
       folder: Folder of the answers.
-      rate: Largest number of control steps per second.
+      rate: Largest number of control steps per second; 10 is real time.
 
     Raises:
       SpecError: If the design has no such provider, or two that ask the same.
@@ -93,17 +91,15 @@ class Supervision:
           f'design {design.name!r}: two providers with the live source ask for'
           f' the same: {self._asks}; allowed is one for each question'
       )
-    self._view = views.first_person(env)
+    self._view = views.View(env)
     # Pictures of the control steps of both clips.
     self._pictures: deque[bytes] = deque(maxlen=2 * clip)
     self._question: tuple[dict[str, Any], _Clips] | None = None
     self._is_running = False
     self._deadline = 0.0
-    self._given: dict[str, tuple[float, float]] = {}
-    self._written: list[float] = []
+    self._given: dict[str, float] = {}
     self._log: list[dict[str, Any]] = []
     self._track: tracking.Track | None = None
-    self.delays: list[float] = []
 
   def run(self, policy: Any, episode: int) -> results.EpisodeResult:
     """Runs a supervised episode.
@@ -153,8 +149,7 @@ class Supervision:
       for episode in range(num_episodes):
         evaluation.add(info, self.run(policy, episode))
       _, summary = evaluation.summarize(f'# {world.domain}.{world.task}')
-    where = f'The answers are in {folder / ANSWERS}'
-    text = f'{summary}\n\n{delays_text(self.delays)}\n\n{where}'
+    text = f'{summary}\n\nThe answers are in {folder / ANSWERS}'
     self._server.send({'type': 'summary', 'text': text})
     say(text)
 
@@ -164,10 +159,6 @@ class Supervision:
 
   def _on_step(self, unused_physics: Any, track: tracking.Track) -> None:
     """Shows a control step, and waits for the next one."""
-    now = time.time()
-    # The answers of this step have been written to their registers.
-    self.delays.extend(now - clicked for clicked in self._written)
-    self._written.clear()
     self._track = track
     if not track.num_steps:
       self._pictures.clear()
@@ -217,12 +208,10 @@ class Supervision:
           and answer_sources.STOP not in self._given
       ):
         self._receive(_PATIENCE)
-    answer = self._given.pop(asks, None)
-    if answer is None:
+    value = self._given.pop(asks, None)
+    if value is None:
       return None
     self._question = None
-    value, clicked = answer
-    self._written.append(clicked)
     env, track = self._env, self._track
     self._log.append(
         {
@@ -234,7 +223,7 @@ class Supervision:
             'value': value,
             'action': None if question.query is None else int(question.query),
             'key': np.asarray(question.key).tolist(),
-            'time': clicked,
+            'time': time.time(),
         }
     )
     return value
@@ -295,13 +284,8 @@ class Supervision:
           'type': 'answer',
           'asks': str(asks),
           'value': int(value),
-          'time': int(clicked) | float(clicked),
-      } if (
-          asks in self._asks
-          and value in self._allowed(asks)
-          and 0 <= clicked < _LATEST
-      ):
-        self._given[asks] = float(value), clicked / 1e3
+      } if asks in self._asks and value in self._allowed(asks):
+        self._given[asks] = float(value)
     return True
 
   def _allowed(self, asks: str) -> Collection[int]:
@@ -319,18 +303,3 @@ class Supervision:
       with open(self._path, 'a', encoding='utf-8') as file:
         file.writelines(json.dumps(one) + '\n' for one in self._log)
     self._log.clear()
-
-
-def delays_text(delays: list[float]) -> str:
-  """Returns the delays of answers as a sentence.
-
-  Args:
-    delays: Time from each click to its write, in seconds.
-  """
-  if not delays:
-    return 'There were no answers.'
-  median, late = 1e3 * np.percentile(delays, [50, 95])
-  return (
-      f'{len(delays)} answers; from click to write {median:.0f} ms (median) and'
-      f' {late:.0f} ms (95 %).'
-  )

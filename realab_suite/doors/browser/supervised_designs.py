@@ -10,7 +10,7 @@ _SIZES: dict[str, Any] = {'kind': 'two_block', 'scale': 0.1}
 
 def design(
     asks: str,
-    source: str = 'simulated',
+    source: str = 'live',
     options: dict[str, Any] | None = None,
     *,
     waits: bool = False,

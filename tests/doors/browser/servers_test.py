@@ -24,7 +24,7 @@ _UPGRADE = (
 
 @pytest.fixture(name='server')
 def fixture_server():
-  with servers.PageServer('supervise') as server:
+  with servers.PageServer() as server:
     yield server
 
 
