@@ -153,30 +153,9 @@ _REGISTERS = pa.schema([
     _figure('world', _REGISTER, "The world's part of it."),
 ])  # fmt: skip
 
-_ACCESSES = pa.schema([
-    _ID,
-    _STEP,
-    _NAME,
-    _column('index', _INT32, '',
-            'Position among the accesses of the register.'),
-    _column('is_write', _BOOL, '', 'True for a write, False for a read.'),
-    _column('party', _TEXT, '',
-            'Writer or reader: agent, initial, a meter or a provider.'),
-    _figure('requested', _REGISTER, 'Requested value of a write.'),
-    _figure('applied', _REGISTER, 'Applied value of a write.'),
-    _figure('reading', _REGISTER, 'Value that was read.'),
-    _figure('clean', _REGISTER,
-            'Clean content after the write, or at the read.'),
-    _column('obstruction', _FLOAT, _REGISTER,
-            'Obstruction of the write or read.'),
-    _figure('permanent', _REGISTER, 'Permanent part of a read.'),
-    _figure('temporary', _REGISTER, 'Temporary part of a read.'),
-])  # fmt: skip
-
 EVALUATOR: Final = {
     'episodes': _EPISODES,
     'steps': _STEP_FIGURES,
     'registers': _REGISTERS,
-    'accesses': _ACCESSES,
 }
 """Columns of each table in the folder `evaluator`."""

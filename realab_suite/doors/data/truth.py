@@ -35,7 +35,6 @@ def rows(episode: recording.Episode, episode_id: int) -> dict[str, list[Row]]:
       'episodes': [_episode(episode, steps)],
       'steps': steps,
       'registers': [row for rows_of_step in by_step for row in rows_of_step],
-      'accesses': list(_accesses(episode)),
   }
   return {
       name: [{'episode_id': episode_id, **row} for row in table]
@@ -200,27 +199,6 @@ def _register(episode: recording.Episode, name: str) -> Iterator[Row]:
         'agent': float(moved.agent[step - 1]) if step else None,
         'world': float(moved.world[step - 1]) if step else None,
     }
-
-
-def _accesses(episode: recording.Episode) -> Iterator[Row]:
-  for name, entries in episode.ledger.entries.items():
-    for index, entry in enumerate(entries):
-      is_write = isinstance(entry, registers.Write)
-      yield {
-          'step': entry.step,
-          'register': name,
-          'index': index,
-          'is_write': is_write,
-          'party': entry[1],
-          **{
-              field: _known(getattr(entry, field))
-              for field in (
-                  ('requested', 'applied', 'obstruction', 'clean')
-                  if is_write
-                  else ('reading', 'clean', *_PARTS)
-              )
-          },
-      }
 
 
 def _known(value: float | None) -> float | None:
