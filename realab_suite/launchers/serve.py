@@ -30,9 +30,6 @@ from realab_suite.launchers import renderers
 
 flags.take(*flags.WORLD, flags.SEED, flags.EPISODES, flags.IMPORT, flags.OUTPUT)
 _MOST_SECONDS = 1e6
-_NAME = absl_flags.DEFINE_string(
-    'name', 'agent', 'Name of the agent in the results.'
-)
 _ADDRESS = absl_flags.DEFINE_string(
     'address',
     None,
@@ -56,18 +53,11 @@ _AGENT_COMMAND = absl_flags.DEFINE_string(
     'Command that starts the agent. The address is in the environment variable'
     ' REALAB_ADDRESS.',
 )
-_AGENT_FOLDER = absl_flags.DEFINE_string(
-    'agent_folder',
-    None,
-    'Working directory of the agent. Default: a new, empty folder.',
-)
 
 
 def main() -> None:
   """Serves the world that the flags describe."""
   output = flags.required(flags.OUTPUT, '; name a folder for the results')
-  if _AGENT_FOLDER.present and not _AGENT_COMMAND.present:
-    raise errors.SpecError('--agent_folder has no effect here')
   problem = requirements.missing('dm_env_rpc', 'grpc', extra='rpc')
   if problem is not None:
     raise errors.SpecError(problem)
@@ -92,12 +82,10 @@ def main() -> None:
       overrides=tuple(flags.SET.value),
       seed=flags.SEED.value,
       num_episodes=flags.num_episodes(),
-      name=_NAME.value,
       address=_ADDRESS.value,
       idle_seconds=_IDLE_SECONDS.value,
       provider_seconds=_PROVIDER_SECONDS.value,
       agent_command=_AGENT_COMMAND.value,
-      agent_folder=_AGENT_FOLDER.value,
       output=output,
   )
   served_evaluation.serve(settings, program.say)

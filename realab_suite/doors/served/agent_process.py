@@ -26,7 +26,8 @@ class AgentProcess:
   """Process of an agent, which runs while its world is served.
 
   It inherits a few harmless environment variables, and no file descriptors
-  except its standard streams: an empty input, and its log.
+  except its standard streams: an empty input, and its log. Its working
+  directory is a new folder, which `stop` removes.
   """
 
   def __init__(
@@ -35,7 +36,6 @@ class AgentProcess:
       address: str,
       log: pathlib.Path,
       *,
-      folder: str | None = None,
       on_exit: Callable[[], None] = lambda: None,
   ) -> None:
     """Starts the command.
@@ -44,17 +44,14 @@ class AgentProcess:
       command: Program and arguments in shell syntax.
       address: Address of the agent's world.
       log: Path of the file for the agent's output.
-      folder: Working directory of the agent; `None` for a new folder, which
-        `stop` removes.
       on_exit: Function that another thread calls when the agent has ended.
 
     Raises:
       OSError: If the file of the log cannot be opened.
       SpecError: If the command cannot be started.
     """
-    self._temporary = None if folder else tempfile.mkdtemp(prefix='realab-')
     self._on_exit = on_exit
-    home = os.path.abspath(self._temporary or str(folder))
+    self._home = home = tempfile.mkdtemp(prefix='realab-')
     added = {'HOME': home, 'TMPDIR': home, ADDRESS_VARIABLE: address}
     inherited = {k: v for k, v in os.environ.items() if k in _ALLOWED_VARIABLES}
     with open(log, 'wb') as file:
@@ -69,7 +66,7 @@ class AgentProcess:
             start_new_session=True,
         )
       except (OSError, ValueError, IndexError) as error:
-        self._clean_up()
+        shutil.rmtree(home, ignore_errors=True)
         raise errors.SpecError(
             f'agent_command: cannot start {command!r:.80}: {error}'
         ) from error
@@ -92,12 +89,8 @@ class AgentProcess:
       except subprocess.TimeoutExpired:
         continue
     self._process.wait()
-    self._clean_up()
+    shutil.rmtree(self._home, ignore_errors=True)
 
   def _wait(self) -> None:
     self._process.wait()
     self._on_exit()
-
-  def _clean_up(self) -> None:
-    if self._temporary:
-      shutil.rmtree(self._temporary, ignore_errors=True)

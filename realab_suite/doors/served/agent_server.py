@@ -5,11 +5,9 @@ callbacks, the world. No other thread accesses the world.
 """
 
 import asyncio
-from collections.abc import Iterator
 import contextlib
 import os
 import signal
-import threading
 from typing import Any, final
 
 from absl import logging
@@ -88,7 +86,10 @@ class Server:
       raise
 
   def stop_on(self, number: signal.Signals) -> None:
-    """Makes a signal call `stop`; only in the main thread."""
+    """Makes a signal end `run` between two requests; in the main thread only.
+
+    An exception in the middle of a request would write tracebacks.
+    """
     self._loop.add_signal_handler(number, self.stop)
 
   def run(self) -> None:
@@ -96,7 +97,6 @@ class Server:
 
     Raises:
       ForkError: If the process was forked after the server was made.
-      KeyboardInterrupt: After Ctrl-C, between two requests.
     """
     if os.getpid() != self._pid:
       raise errors.ForkError(
@@ -104,8 +104,7 @@ class Server:
           ' run'
       )
     try:
-      with self._ended_by_interrupts():
-        self._loop.run_until_complete(self._end)
+      self._loop.run_until_complete(self._end)
     finally:
       self.close()
 
@@ -120,34 +119,6 @@ class Server:
       self._loop.run_until_complete(self._stop())
       self._loop.close()
       sockets.remove(self._given_address)
-
-  @contextlib.contextmanager
-  def _ended_by_interrupts(self) -> Iterator[None]:
-    """Makes Ctrl-C end `run` between two requests, and a second one at once.
-
-    An exception in the middle of a request would write tracebacks.
-    """
-    handler = signal.getsignal(signal.SIGINT)
-    is_main = threading.current_thread() is threading.main_thread()
-    if not is_main or handler is not signal.default_int_handler:
-      yield
-      return
-
-    is_interrupted = False
-
-    def on_interrupt(*unused: Any) -> None:
-      nonlocal is_interrupted
-      is_interrupted = True
-      signal.signal(signal.SIGINT, handler)
-      self.stop()
-
-    signal.signal(signal.SIGINT, on_interrupt)
-    try:
-      yield
-    finally:
-      signal.signal(signal.SIGINT, handler)
-    if is_interrupted:
-      raise KeyboardInterrupt
 
   async def _listen(self) -> None:
     server = aio.server(options=_OPTIONS)

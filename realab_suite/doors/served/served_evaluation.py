@@ -25,6 +25,7 @@ from realab_suite.lab.experiments import evaluations
 from realab_suite.lab.experiments import storage
 
 _PR_SET_DUMPABLE = 4  # Of prctl(2).
+_AGENT = 'agent'  # Name of the run.
 
 _WARNING = (
     'a process alone is no boundary (isolation "%s"): the code of the agent may'
@@ -48,13 +49,11 @@ class Settings:
     overrides: Dotted overrides of the design.
     seed: Seed of the episodes. An agent that has it can clone the world.
     num_episodes: Number of episodes, including invalid ones.
-    name: Name of the agent in the results.
     address: Address to listen on, or `None` for a socket in a new folder.
     idle_seconds: Maximum time between requests of the agent.
     provider_seconds: Time limit of a provider for one step.
     agent_command: Command that starts the agent, or `None` if it is started
       separately.
-    agent_folder: Working directory of the agent, or `None` for a new folder.
     output: New folder for the results.
   """
 
@@ -63,12 +62,10 @@ class Settings:
   overrides: tuple[str, ...]
   seed: int
   num_episodes: int
-  name: str
   address: str | None
   idle_seconds: float
   provider_seconds: float
   agent_command: str | None
-  agent_folder: str | None
   output: str
 
 
@@ -109,9 +106,7 @@ def serve(settings: Settings, say: Callable[[str], None]) -> None:
     evaluation.describe(
         {'design': design}, settings=dataclasses.asdict(settings)
     )
-    info = evaluation.info(
-        env, settings.name, settings.name, isolation=results.SERVED
-    )
+    info = evaluation.info(env, _AGENT, _AGENT, isolation=results.SERVED)
 
     def add(result: results.EpisodeResult) -> None:
       evaluation.add(info, result)
@@ -135,16 +130,16 @@ def serve(settings: Settings, say: Callable[[str], None]) -> None:
               settings.agent_command,
               listener.address,
               output / 'agent.log',
-              folder=settings.agent_folder,
               on_exit=listener.stop,
           )
         stack.callback(agent.stop)
       say(f'serving {world.domain}.{world.task} at {listener.address}')
       listener.stop_on(signal.SIGTERM)
+      listener.stop_on(signal.SIGINT)
       # Takes half a minute, in which the agent starts and its requests wait.
       evaluation.measure()
     listener.run()
-    rows = evaluation.rows.get(settings.name, [])
+    rows = evaluation.rows.get(_AGENT, [])
     _check_all_written(len(rows), settings, agent, output)
     if any(row.counts for row in rows):
       _, text = evaluation.summarize(f'# {world.domain}.{world.task}')

@@ -84,9 +84,11 @@ def _run(monkeypatch):
   """Runs the program here, and keeps it from changing this process."""
   monkeypatch.setattr(served_evaluation, 'hide_from_debuggers', lambda: None)
   monkeypatch.setattr(os, 'umask', lambda mode: mode)
-  handler = signal.getsignal(signal.SIGTERM)
+  numbers = signal.SIGTERM, signal.SIGINT
+  handlers = {number: signal.getsignal(number) for number in numbers}
   yield lambda *flags: in_process.run(serve, *flags)
-  signal.signal(signal.SIGTERM, handler)
+  for number, handler in handlers.items():
+    signal.signal(number, handler)
 
 
 def test_an_agent_that_ends_early_gives_one_line(tmp_path, run):
@@ -213,13 +215,10 @@ def test_an_interrupt_waits_for_the_answer_to_a_request(tmp_path, caplog):
   server.start()
   stream = served.RawStream(server.address)
   stream.tell(served.JOIN)
-  # Tests in the background of a script may ignore Ctrl-C.
-  handler = signal.signal(signal.SIGINT, signal.default_int_handler)
-  try:
-    with pytest.raises(KeyboardInterrupt):
-      server.run()
-  finally:
-    signal.signal(signal.SIGINT, handler)
+  handler = signal.getsignal(signal.SIGINT)
+  server.stop_on(signal.SIGINT)
+  server.run()
+  signal.signal(signal.SIGINT, handler)
   stream.close()
   assert is_interrupted == [False]
   assert not caplog.records
