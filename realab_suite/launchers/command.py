@@ -6,15 +6,12 @@ is short for `python -m realab_suite.launchers.sweep` with the same flags.
 """
 
 from collections.abc import Mapping
-import datetime
 import os
 import runpy
-import subprocess
 import sys
 
 from realab_suite import __version__
 from realab_suite.config import messages
-from realab_suite.lab.experiments import requirements
 from realab_suite.launchers import program
 
 _LAUNCHERS = 'realab_suite.launchers.'
@@ -37,23 +34,6 @@ COMMANDS: Mapping[str, str] = {
     'train': 'run one job',
 }
 """Subcommands with their purposes."""
-_WITHOUT_FLAGS = {
-    'demo': (
-        'Trains agents in Unlock Door, and reports on them. Writes into a new'
-        ' folder results/demo-*.'
-    ),
-    'doctor': 'Says what works in this installation, and how to repair it.',
-}
-_NEXT = """
-One seed shows that tampering is learned, not how often. Next:
-  realab sweep --experiment=meter_only --output=results/meter_only
-                                          five seeds, another register
-  realab audit --task=unlock_door.near --output=results/audit
-                                          search for an exploit, untrained
-  realab report --input={output}
-                                          write this report again
-"""
-_DEMO_NEEDS = ('jax', 'equinox', 'optax', 'matplotlib', 'jinja2')
 
 
 def main() -> int:
@@ -77,13 +57,6 @@ def main() -> int:
     return _refuse(
         f'command {name!r:.80} is unknown{hint}; known are' f' {list(COMMANDS)}'
     )
-  if name in _WITHOUT_FLAGS and rest in (['-h'], ['--help']):
-    sys.stdout.write(f'usage: realab {name}\n\n{_WITHOUT_FLAGS[name]}\n')
-    return 0
-  if name in _WITHOUT_FLAGS and rest:
-    return _refuse(f'{name}: arguments {rest}; allowed are none')
-  if name == 'demo':
-    return _demo()
   module = _LAUNCHERS + name
   # As `python -m` does, so that --help, --import of modules in the working
   # directory, and the start of processes work.
@@ -108,23 +81,3 @@ def _usage() -> str:
 def _refuse(problem: str) -> int:
   sys.stderr.write(f'error: {problem}\n')
   return program.USAGE_ERROR
-
-
-def _demo() -> int:
-  """Does what `make demo` does, in the packages that are installed."""
-  # Before the jobs, of which only those of learners would fail.
-  if problem := requirements.missing(*_DEMO_NEEDS, extra='agents,report'):
-    return _refuse(f'demo: {problem}')
-  now = datetime.datetime.now().astimezone()
-  output = f'results/demo-{now:%Y%m%d-%H%M%S}'
-  for name, flags in (
-      ('sweep', ('--experiment=quick', f'--output={output}')),
-      ('report', (f'--input={output}',)),
-  ):
-    ran = subprocess.run(
-        [sys.executable, '-m', _LAUNCHERS + name, *flags], check=False
-    )
-    if ran.returncode:
-      return ran.returncode
-  sys.stdout.write(_NEXT.format(output=output))
-  return 0

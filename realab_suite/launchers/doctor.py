@@ -10,10 +10,10 @@ from collections.abc import Mapping
 from importlib import metadata
 import os
 import platform
-import sys
 from typing import NamedTuple, final
 
 from realab_suite.lab.experiments import requirements
+from realab_suite.launchers import program
 from realab_suite.launchers import renderers
 
 # Packages whose versions decide what happens.
@@ -105,10 +105,9 @@ def _labmaze() -> str:
 
 def _tell(name: str, text: str, remedy: str = '') -> None:
   """Prints the result of a check, with a remedy if something does not work."""
-  sys.stdout.write(f'{"--" if remedy else "ok"}  {name:10} {text}\n')
+  program.say(f'{"--" if remedy else "ok"}  {name:10} {text}')
   if remedy:
-    sys.stdout.write(f'{"":14} to repair: {remedy}\n')
-  sys.stdout.flush()
+    program.say(f'{"":14} to repair: {remedy}')
 
 
 def main() -> int:
@@ -117,7 +116,7 @@ def main() -> int:
   Returns:
     0 if the core works, otherwise 1.
   """
-  sys.stdout.write(f'{versions()}\n')
+  program.say(versions())
   core = renderers.problem_of(_STEPS_A_WORLD, 'step', os.environ)
   if core:
     _tell('core', f'cannot step a world: {core}', _CORE_REMEDY)
@@ -136,4 +135,4 @@ def main() -> int:
 
 
 if __name__ == '__main__':
-  sys.exit(main())
+  program.start(main)

@@ -1,4 +1,4 @@
-"""Shows a world in a window, or writes a film if no window can be opened.
+"""Shows a world in a window, or writes a film with --video.
 
 By default, a saboteur of the world acts. This shows the solver of Unlock Door:
 
@@ -7,8 +7,6 @@ By default, a saboteur of the world acts. This shows the solver of Unlock Door:
 
 from collections.abc import Callable, Iterator
 import contextlib
-import itertools
-import os
 from typing import Any
 
 import dm_env
@@ -33,8 +31,9 @@ def main() -> None:
   if flags.VIDEO.value is not None:
     _write_film()
   elif problem := renderers.why_no_window():
-    program.say(f'No window can be opened: {problem}')
-    _write_film()
+    raise errors.ResultsError(
+        f'no window can be opened: {problem}; --video=world.mp4 writes a film'
+    )
   else:
     _open_window()
 
@@ -54,9 +53,8 @@ def _write_film() -> None:
   from realab_suite.lab.experiments import tracking
   from realab_suite.reports import films
 
-  world = '_'.join(flags.domain_and_task())
+  path = flags.VIDEO.value
   with _loaded() as (env, policy, name):
-    path = flags.VIDEO.value or _unused(f'{world}_{name}_{flags.SEED.value}')
     program.say(f'Filming an episode of {name}; this may take minutes')
     with films.film(env, path, name) as add:
       recorder = tracking.Tracker(env, add)
@@ -75,16 +73,6 @@ def _policy_name(env: Any) -> str:
   if flags.POLICY.present or not (saboteurs and is_attackable):
     return str(flags.POLICY.value)
   return str(saboteurs[0])
-
-
-def _unused(stem: str) -> str:
-  """Returns the name of a film that does not exist yet."""
-  path = f'{stem}.mp4'
-  for number in itertools.count(2):
-    if not os.path.exists(path):
-      break
-    path = f'{stem}_{number}.mp4'
-  return path
 
 
 @contextlib.contextmanager

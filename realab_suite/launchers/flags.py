@@ -85,16 +85,11 @@ POLICY = _define_string(
 )
 
 # The world and the design.
-DOMAIN = _define_string(
-    'domain',
-    'unlock_door',
-    'Domain, such as unlock_door or collect_apples.',
-)
 TASK = _define_string(
     'task',
-    'standard',
-    'Task of the domain, such as standard, near or far; or with its domain,'
-    ' such as unlock_door.near.',
+    'unlock_door.standard',
+    'Domain and task, such as unlock_door.near; or a task of unlock_door alone,'
+    ' such as standard, near or far.',
 )
 MAX_STEPS = _define_integer(
     'max_steps',
@@ -124,7 +119,7 @@ SET = _define_multi_string(
     [],
     'Dotted override of the design, such as --set=registers.reward.scale=0.2',
 )
-WORLD = (DOMAIN, TASK, MAX_STEPS, SENSES, TASK_KWARGS, DESIGN, SET)
+WORLD = (TASK, MAX_STEPS, SENSES, TASK_KWARGS, DESIGN, SET)
 TARGET = _define_string(
     'target',
     None,
@@ -236,45 +231,25 @@ def seeds() -> tuple[int, ...]:
   """
   text = SEEDS.value
   is_list = ',' in text
-  parts = [part.strip() for part in text.split(',') if part.strip()]
   # At most as many digits as the largest seed: `int` rejects thousands.
-  numbers = [int(part) for part in parts if re.fullmatch('[0-9]{1,10}', part)]
-  least, most = (0, LARGEST_SEED) if is_list else (1, _MOST_SEEDS)
-  if not (
-      parts
-      and len(numbers) == len(parts)
-      and all(least <= number <= most for number in numbers)
-  ):
-    raise errors.SpecError(
-        f'--seeds={text:.40}: allowed are a number from 1 to {_MOST_SEEDS},'
-        f' such as 5, and a list of seeds from 0 to {LARGEST_SEED}, such as'
-        ' 3,4,5'
-    )
-  return tuple(numbers) if is_list else tuple(range(numbers[0]))
-
-
-def domain_and_task() -> tuple[str, str]:
-  """Returns the names of the domain and the task.
-
-  Raises:
-    SpecError: If the flags name two domains.
-  """
-  domain, task = task_names.split(TASK.value)
-  if not domain:
-    return DOMAIN.value, task
-  if DOMAIN.present and DOMAIN.value != domain:
-    raise errors.SpecError(
-        f'--task={TASK.value} is not a task of --domain={DOMAIN.value}'
-    )
-  return domain, task
+  if re.fullmatch(r'[0-9]{1,10}(,[0-9]{1,10})*,?', text):
+    numbers = tuple(map(int, text.removesuffix(',').split(',')))
+    if is_list and max(numbers) <= LARGEST_SEED:
+      return numbers
+    if not is_list and 1 <= numbers[0] <= _MOST_SEEDS:
+      return tuple(range(numbers[0]))
+  raise errors.SpecError(
+      f'--seeds={text:.40}: must be a number from 1 to {_MOST_SEEDS}, such as'
+      f' 5, or a list of seeds from 0 to {LARGEST_SEED}, such as 3,4,5'
+  )
 
 
 def world() -> 'worlds.World':
   """Returns the world that the flags describe.
 
   Raises:
-    SpecError: If the flags name two domains, or the arguments of the task are
-      not a YAML mapping or contain the seed.
+    SpecError: If the arguments of the task are not a YAML mapping, or contain
+      the seed.
   """
   from realab_suite import worlds
 
@@ -284,8 +259,10 @@ def world() -> 'worlds.World':
         '--task_kwargs: random: seeds have flags of their own; allowed are'
         ' arguments of the task'
     )
+  domain, task = task_names.split(TASK.value)
   return worlds.World(
-      *domain_and_task(),
+      domain or 'unlock_door',
+      task,
       MAX_STEPS.value,
       kwargs,
       None if SENSES.value is None else tuple(SENSES.value),

@@ -22,7 +22,6 @@ from realab_suite.launchers import program
 from realab_suite.launchers import renderers
 
 flags.take(
-    flags.DOMAIN,
     flags.TASK,
     flags.MAX_STEPS,
     flags.SET,

@@ -67,7 +67,6 @@ def main() -> None:
           f'--{seconds.name}={seconds.value:g}; allowed is more than 0, and at'
           f' most {_MOST_SECONDS:g}'
       )
-  flags.domain_and_task()  # Raises errors before slow imports.
   renderers.render_on_demand()
   # gRPC reads this once. The server never forks without executing another
   # program at once.
