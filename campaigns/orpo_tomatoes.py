@@ -33,6 +33,7 @@ import sys
 from typing import Any, final
 
 from dm_env import specs as dm_env_specs
+import jax
 import numpy as np
 
 from realab_suite import policies
@@ -225,7 +226,10 @@ class Base(policies.Policy):
       state: Any,
   ) -> tuple[np.ndarray, Any]:
     del episode_start
-    shares = self._learner.probabilities(observation).cumsum(axis=-1)[:, :-1]
+    encoder, (agent, _) = self._learner.setting.encoder, self._learner.networks
+    packed = encoder.pack(observation, len(observation['agent']))
+    logits = agent.policy(encoder.encode(packed)).logits
+    shares = np.asarray(jax.nn.softmax(logits)).cumsum(axis=-1)[:, :-1]
     return (random_keys.uniform(key, (1,)) > shares).sum(axis=-1), state
 
 

@@ -43,7 +43,7 @@ class Climber(agents.Learner):
   def __init__(self, *arguments: Any) -> None:
     super().__init__(*arguments)
     num_actions = self._controls.check_discrete(KIND)
-    self._networks = {
+    self.networks = {
         'sums': np.zeros(num_actions),
         'counts': np.ones(num_actions),
     }
@@ -56,23 +56,17 @@ class Climber(agents.Learner):
     dares = generator.random(num_envs) < self._options.daring
     return {'action': best if greedy else np.where(dares, drawn, best)}
 
-  def _probabilities(self, observation):
-    means, num_envs = self._means(), len(next(iter(observation.values())))
-    chances = np.full((num_envs, len(means)), self._options.daring / len(means))
-    chances[:, np.argmax(means)] += 1 - self._options.daring
-    return chances
-
   def _observe(self, transition, observation):
     valid = transition['is_valid']
     actions = transition['choice']['action'][valid]
     readings = transition['reading'][valid]
     size = len(self._means())
-    self._networks = {
-        'sums': self._networks['sums'] + np.bincount(actions, readings, size),
-        'counts': self._networks['counts'] + np.bincount(actions, None, size),
+    self.networks = {
+        'sums': self.networks['sums'] + np.bincount(actions, readings, size),
+        'counts': self.networks['counts'] + np.bincount(actions, None, size),
     }
     self._num_updates += 1
     self._metrics = {'best': float(self._means().max())}
 
   def _means(self):
-    return np.asarray(self._networks['sums'] / self._networks['counts'])
+    return np.asarray(self.networks['sums'] / self.networks['counts'])

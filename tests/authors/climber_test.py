@@ -99,9 +99,9 @@ def _breach(climber: Any, **members: Any) -> Any:
 
 
 def _forgets(self: Any, state: Any) -> None:
-  means = self._networks
+  means = self.networks
   agents.Learner.set_state(self, state)
-  self._networks = means
+  self.networks = means
 
 
 def _draws(self: Any, observation: Any, keys: Any, greedy: bool) -> Any:

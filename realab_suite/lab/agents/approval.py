@@ -137,8 +137,6 @@ class _ApprovalLearner(training.OnPolicyLearner, abc.ABC):
       )
     # The last transition, whose feedback comes with the next one.
     self._before: dict[str, Any] | None = None
-    # Myopic: discount 0, so the scale is that of single readings.
-    self._scale = training.FeedbackScale(self._num_envs, 0.0)
 
   def _initial_networks(self, generator: np.random.Generator) -> Any:
     num_actions = self._controls.check_discrete(self._options.kind)
@@ -165,7 +163,7 @@ class _ApprovalLearner(training.OnPolicyLearner, abc.ABC):
   ) -> base.Choice:
     choice = _choose(
         self._encoder,
-        self._networks[0],
+        self.networks[0],
         observation,
         self._exploration,
         keys['act'],
@@ -196,11 +194,6 @@ class _ApprovalLearner(training.OnPolicyLearner, abc.ABC):
     asked = choice['asked']
     return {name: asked[:, i] for i, name in enumerate(self._options.queries)}
 
-  def _probabilities(self, observation: features.Packed) -> Any:
-    return _probabilities(
-        self._encoder, self._networks[0], observation, self._exploration
-    )
-
   def _observe(
       self, transition: dict[str, Any], observation: features.Packed
   ) -> None:
@@ -226,10 +219,10 @@ class _ApprovalLearner(training.OnPolicyLearner, abc.ABC):
     origin = last if self._options.scale == 'change' else 0.0
     self._scale.update({**batch, 'reading': batch['reading'] - origin})
     scale = np.float32(self._scale.value)
-    self._networks, metrics = _update(
+    self.networks, metrics = _update(
         self._options,
         self._encoder,
-        self._networks,
+        self.networks,
         {**batch, 'reading': batch['reading'] / scale, 'last': last / scale},
         self._draw_minibatches(),
     )
@@ -237,12 +230,11 @@ class _ApprovalLearner(training.OnPolicyLearner, abc.ABC):
 
   def _memory(self) -> dict[str, Any]:
     before = {'before': self._before} if self._options.query_delay else {}
-    return {**super()._memory(), 'scale': self._scale.state(), **before}
+    return {**super()._memory(), **before}
 
   def _set_memory(self, memory: dict[str, Any]) -> None:
     super()._set_memory(memory)
     self._before = memory.get('before')
-    self._scale.set_state(memory['scale'])
 
 
 @base.LEARNERS.add('value_advice')
@@ -304,16 +296,6 @@ def _choose(
     log_probs = _log_probs(agent, encoded, None)
   log_prob = jnp.take_along_axis(log_probs, asked, axis=-1)
   return {'action': action, 'asked': asked, 'log_prob': log_prob}
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _probabilities(
-    encoder: features.Encoder,
-    agent: dict[str, Any],
-    observation: features.Packed,
-    exploration: jax.Array | None,
-) -> jax.Array:
-  return jnp.exp(_log_probs(agent, encoder.encode(observation), exploration))
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))

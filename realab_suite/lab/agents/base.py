@@ -80,7 +80,7 @@ class Setting:
 
   Attributes:
     options: Options of the learner.
-    encoder: Encoder of observations, without the memory of a learner.
+    encoder: Encoder of observations.
     controls: Encoder of actions.
     num_envs: Number of worlds.
   """
@@ -181,7 +181,7 @@ class Learner(abc.ABC):
   largest_credit: float | None = None
   # Networks and the state of the optimiser, a pytree of arrays that a subclass
   # makes in `__init__`.
-  _networks: Any
+  networks: Any
 
   def __init__(
       self,
@@ -221,22 +221,7 @@ class Learner(abc.ABC):
   @property
   def setting(self) -> Setting:
     """The part of the learner that wrappers know."""
-    encoder = self._encoder.without_memory()
-    return Setting(self._options, encoder, self._controls, self._num_envs)
-
-  @property
-  def networks(self) -> Any:
-    """Networks and the state of the optimiser, a pytree of arrays."""
-    return self._networks
-
-  @networks.setter
-  def networks(self, networks: Any) -> None:
-    self._networks = networks
-
-  @property
-  def num_envs(self) -> int:
-    """Number of worlds."""
-    return self._num_envs
+    return Setting(self._options, self._encoder, self._controls, self._num_envs)
 
   @property
   def num_steps(self) -> int:
@@ -323,8 +308,8 @@ class Learner(abc.ABC):
   ) -> Mapping[str, np.ndarray]:
     """Returns the observation for `act`, with what wrappers add to it.
 
-    `act` remembers nothing, so its caller keeps earlier images and the state of
-    a memory: each result is the `earlier` of the next step.
+    `act` remembers nothing, so its caller keeps earlier images: each result is
+    the `earlier` of the next step.
 
     Args:
       time_step: Time step of any number of worlds.
@@ -347,8 +332,7 @@ class Learner(abc.ABC):
 
     Args:
       observation: Observations by name, each `(worlds, ...)`, for any number of
-        worlds; a result of `stack` if the learner has a `frame_stack` above 1
-        or a memory.
+        worlds; a result of `stack` if the learner has a `frame_stack` above 1.
       key: Random key, two numbers of dtype uint32.
       greedy: True to take the best action instead of drawing one.
 
@@ -361,20 +345,9 @@ class Learner(abc.ABC):
     seeds = np.random.SeedSequence([int(word) for word in key]).spawn(2)
     act, query = (child.generate_state(2) for child in seeds)
     keys = {'act': act, 'query': query}
-    return self._encode(self._choose(self._pack(observation), keys, greedy))
-
-  @jax_settings.pinned()
-  def probabilities(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Returns the probability of each action, `(worlds, actions)`.
-
-    Args:
-      observation: Observations by name, as for `act`.
-
-    Raises:
-      SpecError: If the actions are vectors.
-    """
-    self._controls.check_discrete(self._options.kind)
-    return np.asarray(self._probabilities(self._pack(observation)))
+    num_envs = len(next(iter(observation.values())))
+    packed = self._encoder.pack(observation, num_envs)
+    return self._encode(self._choose(packed, keys, greedy))
 
   def settings(self) -> dict[str, Any]:
     """Returns the device and the JAX settings that can change results.
@@ -406,7 +379,7 @@ class Learner(abc.ABC):
         'keys': {name: key.copy() for name, key in self._keys.items()},
         'last': copy.deepcopy(self._last),
         'metrics': dict(self._metrics),
-        'trained': to_plain(self._networks),
+        'trained': to_plain(self.networks),
         'memory': copy.deepcopy(self._memory()),
         'wrappers': copy.deepcopy(
             {wrapper.NAME: wrapper.state() for wrapper in self._wrappers}
@@ -426,17 +399,16 @@ class Learner(abc.ABC):
           f'state of a learner: kind {state.get("kind")!r}; this learner is'
           f' {self._options.kind!r}'
       )
-    networks = from_plain(self._networks, state['trained'])
+    networks = from_plain(self.networks, state['trained'])
     names = sorted(wrapper.NAME for wrapper in self._wrappers)
-    # Checkpoints of earlier versions have no entry for them.
-    wrappers = state.get('wrappers', {})
+    wrappers = state['wrappers']
     if sorted(wrappers) != names:
       raise errors.StateLayoutError(
           f'state of a learner: wrappers {sorted(wrappers)}; must be {names}'
       )
     for wrapper in self._wrappers:
       wrapper.set_state(copy.deepcopy(wrappers[wrapper.NAME]))
-    self._networks = networks
+    self.networks = networks
     self._set_memory(copy.deepcopy(state['memory']))
     self._num_acts = int(state['num_acts'])
     self._num_updates = int(state['num_updates'])
@@ -451,14 +423,6 @@ class Learner(abc.ABC):
   def update_key(self) -> np.ndarray:
     """Returns the random key of the next update, two numbers."""
     return self.key('update', self._num_updates)
-
-  def _initial_generator(self) -> np.random.Generator:
-    """Returns the random generator of the networks' initial weights."""
-    return generator_of(self._keys['initial'])
-
-  def _pack(self, observation: Mapping[str, np.ndarray]) -> features.Packed:
-    num_envs = len(next(iter(observation.values())))
-    return self._encoder.pack(observation, num_envs)
 
   def _encode(self, choice: Choice) -> np.ndarray:
     queries = dict(self._queries(choice))
@@ -503,10 +467,6 @@ class Learner(abc.ABC):
       The `action`, and further arrays that an update needs; each has a leading
       axis of worlds.
     """
-
-  @abc.abstractmethod
-  def _probabilities(self, observation: features.Packed) -> Any:
-    """Returns the probability of each action, `(worlds, actions)`."""
 
   @abc.abstractmethod
   def _observe(

@@ -55,21 +55,18 @@ class BehaviouralCloning(training.OnPolicyLearner):
       greedy: bool,
   ) -> base.Choice:
     action, _ = networks.act(
-        self._encoder, self._networks[0], observation, keys['act'], greedy
+        self._encoder, self.networks[0], observation, keys['act'], greedy
     )
     return {'action': np.asarray(action)}
-
-  def _probabilities(self, observation: features.Packed) -> Any:
-    return networks.probabilities(self._encoder, self._networks[0], observation)
 
   def _learn(
       self, batch: dict[str, Any], observation: features.Packed
   ) -> dict[str, Any]:
     del observation  # There is no demonstration for it yet.
-    self._networks, metrics = _update(
+    self.networks, metrics = _update(
         self._options,
         self._encoder,
-        self._networks,
+        self.networks,
         batch,
         self._draw_minibatches(),
     )

@@ -20,7 +20,6 @@ from realab_suite.lab.agents import jax_settings
 # Class of the wrapper of an option, and the value of the option without one.
 _WRAPPERS: Mapping[str, tuple[Any, Any]] = {
     'frame_stack': (histories.FrameStack, 1),
-    'memory': (histories.MemoryState, 0),
     'defence': (guards.Guard, None),
     'gate': (gates.Gatekeeper, None),
 }

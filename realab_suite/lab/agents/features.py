@@ -14,8 +14,6 @@ from realab_suite.entities import appearance
 
 # Distance at which the feature of a ray has fallen to 1 / e, in metres.
 _RAY_SCALE = 2.0
-# Entry of the memory of a learner; see `Encoder.with_memory`.
-MEMORY = 'learner/memory'
 _DISTANCES, _CLASSES = 'ray_distances', 'ray_classes'
 
 Packed = dict[str, np.ndarray]
@@ -99,20 +97,6 @@ class Encoder:
           f' of the observation is an image: {sorted(observation_spec)}'
       )
     return encoder
-
-  def with_memory(self, units: int) -> 'Encoder':
-    """Returns an encoder whose last features are a memory of a learner, if any.
-
-    Args:
-      units: Number of elements of the entry `MEMORY`; 0 for none.
-    """
-    entries = self.without_memory().entries
-    memory = _Entry(MEMORY, 'plain', (units,), 'float32')
-    return Encoder((*entries, memory) if units else entries)
-
-  def without_memory(self) -> 'Encoder':
-    """Returns an encoder of the same observations without a memory."""
-    return Encoder(tuple(e for e in self.entries if e.name != MEMORY))
 
   @property
   def image_shapes(self) -> dict[str, tuple[int, ...]]:

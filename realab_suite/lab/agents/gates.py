@@ -240,7 +240,7 @@ class Gatekeeper(base.Wrapper):
       blind = defences.blinded(replay['observation'], self._setting)
       replay = {**replay, 'observation': blind}
       options = options.model_copy(update={'gamma': 0.0})
-    key = learner.key('update', learner.num_steps // learner.num_envs)
+    key = learner.key('update', learner.num_steps // self._setting.num_envs)
     for i in range(-(-num_gradients // each)):
       trained, _ = learner.updated(
           trained, base.folded(key, i), options, replay, places, _INJECTED

@@ -72,8 +72,7 @@ class Guard(base.Wrapper):
     readings = {name for name in names if name.startswith('registers/')}
     payers = [name for name, weight in paid.items() if weight]
     declared = {self._key_of(name) for name in (*payers, *defence.reads)}
-    # A memory is made of readings.
-    hidden = {*readings, features.MEMORY} - declared
+    hidden = readings - declared
     if self._key_of(reward) in hidden:
       hidden.add('reading')
     return frozenset(hidden)

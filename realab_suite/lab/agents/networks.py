@@ -230,81 +230,6 @@ class Gaussian(eqx.Module):
 
 
 @final
-class Memory(eqx.Module):
-  """Gated recurrent unit, whose state is the end of the vector of features.
-
-  Outputs are the same features with the state after the observation, so that
-  networks that follow see both. The arithmetic is that of `equinox.nn.GRUCell`.
-  """
-
-  inputs: Network
-  recurrent: Linear
-
-  def __init__(
-      self,
-      encoder: features.Encoder,
-      units: int,
-      generator: np.random.Generator,
-  ) -> None:
-    """Makes a unit whose state has a number of elements."""
-    seen = encoder.without_memory()
-    self.inputs = Network(seen, (), 3 * units, 1.0, generator)
-    self.recurrent = Linear(units, 3 * units, 1.0, generator)
-
-  def __call__(self, encoded: dict[str, jax.Array]) -> dict[str, jax.Array]:
-    """Returns features, given those with the state before an observation."""
-    return self._joined(encoded, self._next(*self._split(encoded)))
-
-  def through(
-      self, encoded: dict[str, jax.Array], continues: jax.Array
-  ) -> dict[str, jax.Array]:
-    """Returns features with the state after each observation of a sequence.
-
-    Args:
-      encoded: Features, each `(time, worlds, ...)`. Only the first states are
-        used.
-      continues: Whether the next observation belongs to the same episode,
-        `(time, worlds)`.
-    """
-    inputs, states = self._split(encoded)
-
-    def one_step(state: jax.Array, now: Any) -> tuple[jax.Array, jax.Array]:
-      inputs, continues = now
-      state = self._next(inputs, state)
-      return jnp.where(continues[..., jnp.newaxis], state, 0.0), state
-
-    _, states = jax.lax.scan(one_step, states[0], (inputs, continues))
-    return self._joined(encoded, states)
-
-  def state(self, encoded: dict[str, jax.Array]) -> jax.Array:
-    """Returns the state in a vector of features, `(..., units)`."""
-    return encoded['vector'][..., -self.recurrent.weight.shape[0] :]
-
-  def _split(
-      self, encoded: dict[str, jax.Array]
-  ) -> tuple[jax.Array, jax.Array]:
-    """Returns the inputs of the gates and the state."""
-    seen = encoded['vector'][..., : -self.recurrent.weight.shape[0]]
-    return self.inputs({**encoded, 'vector': seen}), self.state(encoded)
-
-  def _joined(
-      self, encoded: dict[str, jax.Array], state: jax.Array
-  ) -> dict[str, jax.Array]:
-    seen = encoded['vector'][..., : -state.shape[-1]]
-    return {**encoded, 'vector': jnp.concatenate([seen, state], axis=-1)}
-
-  def _next(self, inputs: jax.Array, state: jax.Array) -> jax.Array:
-    reset, keep, new = jnp.split(inputs, 3, axis=-1)
-    more_reset, more_keep, more_new = jnp.split(
-        self.recurrent(state), 3, axis=-1
-    )
-    reset = jax.nn.sigmoid(reset + more_reset)
-    keep = jax.nn.sigmoid(keep + more_keep)
-    new = jnp.tanh(new + reset * more_new)
-    return new + keep * (state - new)
-
-
-@final
 class Policy(eqx.Module):
   """Network from features to a distribution over actions."""
 
@@ -358,16 +283,6 @@ def act(
   distribution = policy(encoder.encode(observation))
   action = distribution.mode() if greedy else distribution.sample(key)
   return action, distribution.log_prob(action)
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def probabilities(
-    encoder: features.Encoder,
-    policy: Callable[..., Any],
-    observation: features.Packed,
-) -> jax.Array:
-  """Returns the probability of each discrete action, `(worlds, actions)`."""
-  return jax.nn.softmax(policy(encoder.encode(observation)).logits)
 
 
 def _orthogonal(

@@ -8,7 +8,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pydantic
 
 from realab_suite.config import option_types
 from realab_suite.feedback import objectives
@@ -28,7 +27,6 @@ class PolicyGradientOptions(training.OnPolicyOptions):
     gae_lambda: Decay of generalised advantage estimates.
     entropy: Weight of the policy's entropy in the loss.
     clip: Largest change of a probability ratio in one update.
-    memory: Number of units of a recurrent memory before the networks, or 0.
     time_limit: What follows an episode that the time limit ends: `continues` if
       it is worth what the last observation is, as in an episode without end, or
       `ends` if it is worth nothing, as the evaluation counts it. In a run with
@@ -43,7 +41,6 @@ class PolicyGradientOptions(training.OnPolicyOptions):
   gae_lambda: base.Fraction = 0.95
   entropy: base.Weight = 0.01
   clip: base.Fraction = 0.2
-  memory: Annotated[int, pydantic.Field(ge=0, le=4096)] = 0
   time_limit: Literal['continues', 'ends'] = 'continues'
   defence: Annotated[Any, option_types.ModelIn(objectives.DEFENCES)] | None = (
       None
@@ -52,29 +49,10 @@ class PolicyGradientOptions(training.OnPolicyOptions):
 
 @final
 class ActorCritic(eqx.Module):
-  """A policy and its value function, with a memory in common or without."""
+  """A policy and its value function."""
 
   policy: networks.Policy
   value: networks.Network
-  memory: networks.Memory | None = None
-
-  def __call__(
-      self, encoded: dict[str, jax.Array]
-  ) -> networks.Categorical | networks.Gaussian:
-    return self.policy(self.seen(encoded))
-
-  def seen(
-      self, encoded: dict[str, jax.Array], continues: Any = None
-  ) -> dict[str, jax.Array]:
-    """Returns the features that the policy and the value function see.
-
-    With `continues`, they are those of a sequence (`networks.Memory.through`).
-    """
-    if self.memory is None:
-      return encoded
-    if continues is None:
-      return self.memory(encoded)
-    return self.memory.through(encoded, continues)
 
 
 @base.LEARNERS.add('policy_gradient')
@@ -84,29 +62,14 @@ class PolicyGradient(training.OnPolicyLearner):
 
   OPTIONS = PolicyGradientOptions
   READS = 'reward'
-  WRAPPED = ('frame_stack', 'memory', 'defence')
-
-  def __init__(
-      self,
-      options: Any,
-      reading: str,
-      encoder: features.Encoder,
-      *args: Any,
-      **kwargs: Any,
-  ) -> None:
-    encoder = encoder.with_memory(options.memory)
-    super().__init__(options, reading, encoder, *args, **kwargs)
-    self._scale = training.FeedbackScale(self._num_envs, options.gamma)
+  WRAPPED = ('frame_stack', 'defence')
 
   def _initial_networks(self, generator: np.random.Generator) -> Any:
-    hidden, units = self._options.hidden, self._options.memory
-    size, num_actions = self._controls.size, self._controls.num_actions
+    hidden, size = self._options.hidden, self._controls.size
+    is_discrete = self._controls.num_actions is not None
     agent = ActorCritic(
-        networks.Policy(
-            self._encoder, hidden, size, num_actions is not None, generator
-        ),
+        networks.Policy(self._encoder, hidden, size, is_discrete, generator),
         networks.Network(self._encoder, hidden, 1, 1.0, generator),
-        networks.Memory(self._encoder, units, generator) if units else None,
     )
     return agent, training.optimizer(self._options).init(agent)
 
@@ -117,12 +80,13 @@ class PolicyGradient(training.OnPolicyLearner):
       greedy: bool,
   ) -> base.Choice:
     action, log_prob = networks.act(
-        self._encoder, self._networks[0], observation, keys['act'], greedy
+        self._encoder,
+        self.networks[0].policy,
+        observation,
+        keys['act'],
+        greedy,
     )
     return {'action': np.asarray(action), 'log_prob': np.asarray(log_prob)}
-
-  def _probabilities(self, observation: features.Packed) -> Any:
-    return networks.probabilities(self._encoder, self._networks[0], observation)
 
   def _discount(self, time_step: base.TimeStep) -> np.ndarray:
     discount = super()._discount(time_step)
@@ -133,26 +97,18 @@ class PolicyGradient(training.OnPolicyLearner):
   def _learn(
       self, batch: dict[str, Any], observation: features.Packed
   ) -> dict[str, Any]:
-    # A memory goes on where a defence leaves a step out.
-    continues, batch = batch['is_valid'], self._treated(batch)
+    batch = self._treated(batch)
     self._scale.update(batch)
     reading = batch['reading'] / np.float32(self._scale.value)
-    self._networks, metrics = _update(
+    self.networks, metrics = _update(
         self._options,
         self._encoder,
-        self._networks,
-        {**batch, 'reading': reading, 'continues': continues},
+        self.networks,
+        {**batch, 'reading': reading},
         observation,
-        self._draw_minibatches(by_world=self._options.memory > 0),
+        self._draw_minibatches(),
     )
     return {**metrics, 'feedback_scale': self._scale.value}
-
-  def _memory(self) -> dict[str, Any]:
-    return {**super()._memory(), 'scale': self._scale.state()}
-
-  def _set_memory(self, memory: dict[str, Any]) -> None:
-    super()._set_memory(memory)
-    self._scale.set_state(memory['scale'])
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
@@ -170,8 +126,8 @@ def _update(
   """
   agent, _ = trained
   encoded = encoder.encode(batch['observation'])
-  values = agent.value(agent.seen(encoded, batch['continues']))[..., 0]
-  last_value = agent.value(agent.seen(encoder.encode(observation)))[..., 0]
+  values = agent.value(encoded)[..., 0]
+  last_value = agent.value(encoder.encode(observation))[..., 0]
   next_values = jnp.concatenate([values[1:], last_value[jnp.newaxis]])
   advantage = advantages(
       batch, values, next_values, options.gamma, options.gae_lambda
@@ -183,14 +139,11 @@ def _update(
       'advantage': advantage,
       'target': values + advantage,
       'weight': batch['is_valid'].astype(jnp.float32),
-      'continues': batch['continues'],
   }
   if 'is_cloned' in batch:
     data['cloned'] = batch['is_cloned'].astype(jnp.float32)
   loss = functools.partial(_loss, options)
-  return training.run_epochs(
-      options, loss, trained, data, indices, by_world=options.memory > 0
-  )
+  return training.run_epochs(options, loss, trained, data, indices)
 
 
 def advantages(
@@ -235,15 +188,14 @@ def _loss(
     options: PolicyGradientOptions, agent: ActorCritic, data: dict[str, Any]
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
   weight = data['weight']
-  seen = agent.seen(data['encoded'], data['continues'])
-  distribution = agent.policy(seen)
+  distribution = agent.policy(data['encoded'])
   log_prob = distribution.log_prob(data['action'])
   objective = training.clipped_objective(
       log_prob - data['log_prob'],
       training.standardize(data['advantage'], weight),
       options.clip,
   )
-  error = agent.value(seen)[..., 0] - data['target']
+  error = agent.value(data['encoded'])[..., 0] - data['target']
   metrics = {
       'policy_loss': -training.mean(objective, weight),
       'value_loss': 0.5 * training.mean(error**2, weight),

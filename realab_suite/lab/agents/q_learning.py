@@ -81,12 +81,12 @@ class QLearning(base.Learner):
   def __init__(self, options: Any, *args: Any, **kwargs: Any) -> None:
     super().__init__(options, *args, **kwargs)
     num_actions = self._controls.check_discrete(options.kind)
-    generator = self._initial_generator()
+    generator = base.generator_of(self._keys['initial'])
     network = networks.Network(
         self._encoder, options.hidden, num_actions, 0.01, generator
     )
     optimizer_state = training.optimizer(options).init(network)
-    self._networks = ((network, optimizer_state), network)
+    self.networks = ((network, optimizer_state), network)
     self.scale = training.FeedbackScale(self._num_envs, options.gamma)
     self.num_slots = max(
         options.replay_size // self._num_envs, options.num_returns + 2
@@ -106,7 +106,7 @@ class QLearning(base.Learner):
       greedy: bool,
   ) -> base.Choice:
     rate = np.float32(0.0) if greedy else self.exploration
-    action = self.action_of(self._networks, observation, rate, keys['act'])
+    action = self.action_of(self.networks, observation, rate, keys['act'])
     return {'action': action}
 
   def action_of(
@@ -120,11 +120,6 @@ class QLearning(base.Learner):
     network = trained[0][0]
     return np.asarray(
         _act(self._encoder, network, observation, exploration, key)
-    )
-
-  def _probabilities(self, observation: features.Packed) -> Any:
-    return _probabilities(
-        self._encoder, self._networks[0][0], observation, self.exploration
     )
 
   def _observe(
@@ -144,8 +139,8 @@ class QLearning(base.Learner):
         or self.num_stored % options.steps_per_update
     ):
       return
-    self._networks, metrics = self.updated(
-        self._networks, self.update_key(), options, self.replay
+    self.networks, metrics = self.updated(
+        self.networks, self.update_key(), options, self.replay
     )
     self._num_updates += 1
     for wrapper in self._wrappers:
@@ -290,19 +285,6 @@ def _act(
   explores = jax.random.uniform(explore_key, best.shape) < exploration
   drawn = jax.random.randint(action_key, best.shape, 0, values.shape[-1])
   return jnp.where(explores, drawn, best)
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _probabilities(
-    encoder: features.Encoder,
-    network: networks.Network,
-    observation: features.Packed,
-    exploration: jax.Array,
-) -> jax.Array:
-  values = network(encoder.encode(observation))
-  num_actions = values.shape[-1]
-  best = jax.nn.one_hot(jnp.argmax(values, axis=-1), num_actions)
-  return (1.0 - exploration) * best + exploration / num_actions
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))

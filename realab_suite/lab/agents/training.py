@@ -37,7 +37,11 @@ class OnPolicyLearner(base.Learner):
   def __init__(self, *args: Any, **kwargs: Any) -> None:
     super().__init__(*args, **kwargs)
     self._transitions: list[dict[str, Any]] = []
-    self._networks = self._initial_networks(self._initial_generator())
+    # Myopic learners have no discount: the scale is that of single readings.
+    gamma = getattr(self._options, 'gamma', 0.0)
+    self._scale = FeedbackScale(self._num_envs, gamma)
+    generator = base.generator_of(self._keys['initial'])
+    self.networks = self._initial_networks(generator)
 
   def _observe(
       self, transition: dict[str, Any], observation: features.Packed
@@ -53,22 +57,15 @@ class OnPolicyLearner(base.Learner):
     observed = np.mean(reading, where=is_valid) if is_valid.any() else 0.0
     self._report({**metrics, 'observed_feedback': observed})
 
-  def _draw_minibatches(self, by_world: bool = False) -> np.ndarray:
+  def _draw_minibatches(self) -> np.ndarray:
     """Draws the sample indices of the next update, `(gradients, minibatch)`.
 
     An epoch uses each sample once, except for the remainder if the number of
     samples is not a multiple of the number of minibatches. NumPy draws the
     indices, because it is faster than jax.
-
-    Args:
-      by_world: True for indices of worlds, whose steps stay together.
     """
-    number, size = self._num_envs, self._options.minibatch
-    if by_world:
-      size = max(1, size // self._options.steps_per_update)
-    else:
-      number *= self._options.steps_per_update
-    num_minibatches = max(1, number // size)
+    number = self._num_envs * self._options.steps_per_update
+    num_minibatches = max(1, number // self._options.minibatch)
     size = number // num_minibatches
     generator = base.generator_of(self.update_key())
     orders = [
@@ -78,10 +75,11 @@ class OnPolicyLearner(base.Learner):
     return used.reshape(-1, size).astype(np.int32)
 
   def _memory(self) -> dict[str, Any]:
-    return {'transitions': self._transitions}
+    return {'transitions': self._transitions, 'scale': self._scale.state()}
 
   def _set_memory(self, memory: dict[str, Any]) -> None:
     self._transitions = memory['transitions']
+    self._scale.set_state(memory['scale'])
 
   @abc.abstractmethod
   def _initial_networks(self, generator: np.random.Generator) -> Any:
@@ -148,7 +146,6 @@ def run_epochs(
     trained: Any,
     data: Any,
     indices: Any,
-    by_world: bool = False,
 ) -> tuple[Any, dict[str, jax.Array]]:
   """Takes one gradient step for each minibatch.
 
@@ -158,19 +155,14 @@ def run_epochs(
     trained: A network and the optimiser's state.
     data: A pytree of arrays, each `(time, worlds, ...)`.
     indices: Sample indices of minibatches, `(gradients, minibatch)`.
-    by_world: True if they are indices of worlds, of which minibatches contain
-      all steps: `(time, minibatch, ...)`.
 
   Returns:
     The new network and optimiser's state, and the means of the metrics.
   """
-  samples = data
-  if not by_world:
-    samples = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), data)
+  samples = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), data)
 
   def one_step(carry: Any, index: jax.Array) -> Any:
-    chosen = (slice(None), index) if by_world else index
-    minibatch = jax.tree.map(lambda x: x[chosen], samples)
+    minibatch = jax.tree.map(lambda x: x[index], samples)
     return descend(options, loss, carry, minibatch)
 
   trained, metrics = jax.lax.scan(one_step, trained, indices)

@@ -1,5 +1,6 @@
 """Toy environments of many worlds, with specs of their own."""
 
+from collections.abc import Mapping
 import dataclasses
 from typing import Any, NamedTuple
 
@@ -146,61 +147,17 @@ class Aim:
     )
 
 
-@dataclasses.dataclass
-class Recall:
-  """Shows a number in the first step of an episode; the last one asks for it.
+def rates(
+    learner: Any, observation: Mapping[str, np.ndarray], number: int
+) -> np.ndarray:
+  """Returns how often a learner takes each action in its first world.
 
-  All observations except the first are the same in all worlds, and numbers are
-  equally frequent if all episodes begin together (one of `phases`). A policy
-  without a memory, acting greedily, is then right in exactly one of
-  `num_choices` worlds.
+  Args:
+    learner: The learner, with discrete actions.
+    observation: Observations by name, each `(worlds, ...)`.
+    number: Number of draws.
   """
-
-  num_envs: int
-  num_choices: int = 2
-  wait: int = 3
-  phases: int = 1
-
-  def __post_init__(self) -> None:
-    self._generator = np.random.default_rng(0)
-    self._time = np.arange(self.num_envs) % self.phases
-    self._number = np.arange(self.num_envs) % self.num_choices
-    self.right: np.ndarray = np.zeros(0)
-
-  def observation_spec(self) -> dict[str, specs.Array]:
-    return {
-        'shown': specs.BoundedArray((), np.int32, 0, self.num_choices),
-        'reward': specs.Array((), np.float32),
-    }
-
-  def action_spec(self) -> specs.Array:
-    return specs.DiscreteArray(self.num_choices)
-
-  def reset(self) -> ToyStep:
-    return self._show(np.zeros(self.num_envs))
-
-  def step(self, actions: np.ndarray) -> ToyStep:
-    is_asked = self._time == self.wait
-    is_right = is_asked & (actions == self._number)
-    if is_asked.any():
-      self.right = is_right[is_asked]
-    self._time = np.where(self._time == self.wait + 1, 0, self._time + 1)
-    begins = self._time == 0
-    if begins.any():
-      drawn = self._generator.permutation(self.num_envs) % self.num_choices
-      self._number = np.where(begins, drawn, self._number)
-    return self._show(is_right)
-
-  def _show(self, reward: np.ndarray) -> ToyStep:
-    step_type = np.where(
-        self._time == 0, 0, np.where(self._time == self.wait + 1, 2, 1)
-    )
-    shown = np.where(self._time == 0, self._number, self.num_choices)
-    return ToyStep(
-        step_type,
-        np.where(step_type == 2, 0.0, 1.0),
-        {
-            'shown': shown.astype(np.int32),
-            'reward': np.asarray(reward, np.float32),
-        },
-    )
+  repeated = {k: np.repeat(v[:1], number, 0) for k, v in observation.items()}
+  key = np.array([1, 2], np.uint32)
+  taken = learner.act(repeated, key).reshape(number, -1)[:, -1].astype(int)
+  return np.bincount(taken, minlength=learner.setting.controls.size) / number

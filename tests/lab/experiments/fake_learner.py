@@ -54,10 +54,6 @@ class FakeLearner:
     noise = 0.0 if greedy else rng.uniform(size=count)
     return self._actions(np.full(count, self._blend.mean()) + noise)
 
-  def probabilities(self, observation: Any) -> np.ndarray:
-    count = len(next(iter(observation.values())))
-    return np.full((count, 14), 1 / 14)
-
   def settings(self) -> dict[str, Any]:
     return {}
 

@@ -33,11 +33,9 @@ class LearnedReward(base.Defence):
     source: `readings`, or `comparisons` if a reading is 1 where the later of
       two clips was better, -1 where the earlier one was, and 0 otherwise.
     clip: Number of control steps of a clip.
-    refit: `never` to keep the model from `fit_steps` on, `audited` to fit it to
-      readings that are vouched for, `always` to fit it to all of them.
+    refit: `never` to keep the model from `fit_steps` on, `always` to go on
+      fitting it to all readings.
     fit_steps: Control steps, of all worlds, by which it has to be fitted.
-    audited: Name of the register that vouches for a reading.
-    above: A larger reading of `audited` vouches.
     trusted: A policy to whose steps alone the model is fitted.
     nets: Number of networks.
     beta: Softness of their least prediction, see `ensembles.soft_least`, for
@@ -49,10 +47,8 @@ class LearnedReward(base.Defence):
   kind: Literal['learned_reward']
   source: Literal['readings', 'comparisons'] = 'readings'
   clip: _Count | None = None
-  refit: Literal['never', 'audited', 'always'] = 'never'
+  refit: Literal['never', 'always'] = 'never'
   fit_steps: Annotated[int, pydantic.Field(ge=1)] = 200_000
-  audited: str | None = None
-  above: Annotated[float, pydantic.Field(ge=-1e9, le=1e9)] = 0.5
   trusted: trusted_policies.TrustedPolicy | None = None
   nets: Annotated[int, pydantic.Field(ge=1, le=100)] = 4
   beta: Annotated[float, pydantic.Field(ge=0, le=1e9)] | None = 0.0
@@ -61,19 +57,13 @@ class LearnedReward(base.Defence):
 
   @pydantic.model_validator(mode='after')
   def _consistent(self) -> 'LearnedReward':
-    for option, owner, is_used in (
-        ('clip', f'source {self.source}', self.source == 'comparisons'),
-        ('audited', f'refit {self.refit}', self.refit == 'audited'),
-    ):
-      value = getattr(self, option)
-      if (value is not None) != is_used:
-        rule = 'given' if is_used else 'left out'
-        raise ValueError(f'{option}: {value} with {owner}; must be {rule}')
+    is_used = self.source == 'comparisons'
+    if (self.clip is not None) != is_used:
+      rule = 'given' if is_used else 'left out'
+      raise ValueError(
+          f'clip: {self.clip} with source {self.source}; must be {rule}'
+      )
     return self
-
-  @property
-  def reads(self) -> tuple[str, ...]:
-    return () if self.audited is None else (self.audited,)
 
   @property
   def trusts(self) -> trusted_policies.TrustedPolicy | None:
@@ -117,8 +107,6 @@ class LearnedReward(base.Defence):
     is_end = (ages > 0) & (ages % self._span == 0) & (not is_kept)
     if self.trusted is not None:
       is_end &= batch['is_trusted']
-    if self.audited is not None:
-      is_end &= batch['readings'][self.audited] > self.above
     ends = np.flatnonzero(is_end)
     readings = batch['reading'].ravel()[ends].astype(float)
     ensemble, moments = state['ensemble'], state['moments']
