@@ -96,7 +96,7 @@ clean:
 .venv/extras: .venv/docs
 	@echo 'Installing all extras, with PyTorch, into .venv; this takes minutes.'
 	@$(INSTALL) torch==2.13.0 torchrl==0.14.1 \
-		-e '.[cluster,browser,data,sb3,tb]'
+		-e '.[cluster,browser,data,sb3]'
 	@touch $@
 
 # Debian and Ubuntu ship Python without ensurepip; `venv` then creates an

@@ -17,6 +17,7 @@ a lost worker. Prints `engine figure target verdict seed`.
 """
 
 from collections.abc import Mapping
+import contextlib
 import hashlib
 import os
 import pathlib
@@ -43,7 +44,7 @@ _COMMAND = ('-m', 'realab_suite.launchers.sweep')
 _NUM_KILLS = 20
 _STEPS = 8_000
 # Files with times, of the processes themselves, and for continuing.
-_NOT_COMPARED = {training.TIMING, 'lock', scheduler.LOGS, 'checkpoints'}
+_NOT_COMPARED = {training.TIMING, 'lock', scheduler.LOGS, storage.CHECKPOINT}
 
 
 def _experiment(scale: float, seed: int) -> dict[str, Any]:
@@ -128,8 +129,12 @@ class _Sweep:
     )
     return self._process.poll() is None
 
-  def _checkpoints(self) -> set[pathlib.Path]:
-    return set(self.folder.glob('*/checkpoints/*.ckpt'))
+  def _checkpoints(self) -> set[tuple[str, int]]:
+    found = set()
+    for path in self.folder.glob(f'*/{storage.CHECKPOINT}'):
+      with contextlib.suppress(FileNotFoundError):
+        found.add((str(path), path.stat().st_mtime_ns))
+    return found
 
   def kill(self, rng: np.random.Generator) -> None:
     """Kills a running job or its parent, or the sweep if there is no job."""

@@ -62,7 +62,6 @@ EXTRAS: Mapping[str, Extra] = {
         ('matplotlib', 'jinja2', 'imageio', 'av', 'PIL', 'pyarrow'),
         'reports, plots and films',
     ),
-    'tb': Extra(('tensorboardX',), 'learning curves for TensorBoard'),
     'rpc': Extra(('dm_env_rpc', 'grpc'), 'worlds for other processes'),
     'gym': Extra(('gymnasium', 'moviepy'), 'the interface of Gymnasium'),
     'sb3': Extra(('stable_baselines3',), 'training with Stable-Baselines3'),

@@ -154,11 +154,6 @@ EXPERIMENT = _define_string(
     'Name of an experiment that is part of the package, or path of a YAML'
     ' file.',
 )
-TENSORBOARD = _define_boolean(
-    'tensorboard',
-    False,
-    'Also writes learning curves for TensorBoard.',
-)
 
 _SHARED.mark_as_parsed()
 # The launcher that takes a flag is the one whose --help shows it.

@@ -17,7 +17,7 @@ from realab_suite.launchers import flags
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
 
-flags.take(flags.IMPORT, flags.EXPERIMENT, flags.OUTPUT, flags.TENSORBOARD)
+flags.take(flags.IMPORT, flags.EXPERIMENT, flags.OUTPUT)
 
 _ON_TASK = absl_flags.DEFINE_string(
     'on_task',
@@ -59,7 +59,6 @@ def main() -> None:
   from realab_suite.lab.experiments import engines
   from realab_suite.lab.experiments import experiment_specs
   from realab_suite.lab.experiments import jobs
-  from realab_suite.lab.experiments import progress
   from realab_suite.lab.experiments import scheduler
   from realab_suite.lab.experiments import storage
   from realab_suite.lab.experiments import training
@@ -78,11 +77,6 @@ def main() -> None:
       for job in planned
       if not (folder / job.folder() / storage.DONE).exists()
   )
-  if flags.TENSORBOARD.value:
-    progress.check_tensorboard()
-  arguments = flags.import_arguments()
-  if flags.TENSORBOARD.value:
-    arguments.append(f'--{flags.TENSORBOARD.name}')
   engine = engines.ENGINES[_ENGINE.value](_WORKERS.value or os.cpu_count() or 1)
   scheduler.sweep(
       experiment,
@@ -91,7 +85,7 @@ def main() -> None:
       program.say,
       only=only,
       calibration=_CALIBRATION.value,
-      arguments=arguments,
+      arguments=flags.import_arguments(),
   )
 
 

@@ -22,7 +22,6 @@ flags.take(
     flags.RUN,
     flags.SEED,
     flags.OUTPUT,
-    flags.TENSORBOARD,
 )
 
 _PARENT = absl_flags.DEFINE_integer(
@@ -46,9 +45,7 @@ def main() -> None:
 
   flags.load_imports()
   [job] = jobs.plan(experiment_specs.load(name), [flags.SEED.value], [run])
-  options = training.Options(
-      program.say, flags.TENSORBOARD.value, _PARENT.value
-  )
+  options = training.Options(program.say, _PARENT.value)
   training.run(job, pathlib.Path(output), options)
 
 

@@ -40,8 +40,8 @@ def _on_completeness(
     )
   if sweep.unfinished:
     found: dict[str, list[str]] = {}
-    for one in sweep.unfinished:
-      found.setdefault(one.job.run, []).append(str(one.job.seed))
+    for job in sweep.unfinished:
+      found.setdefault(job.run, []).append(str(job.seed))
     missing = ', '.join(
         f'{name} (seed{"s" if len(seeds) > 1 else ""} {", ".join(seeds)})'
         for name, seeds in found.items()

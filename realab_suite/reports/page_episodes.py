@@ -43,7 +43,7 @@ def clips(
   """
   films, problem = [], None
   for run in runs:
-    row = replays.typical_row(run) or replays.first_row(run)
+    row = replays.typical_row(run)
     if row is None:
       continue
     say(f'{run.name}: filming a typical episode')

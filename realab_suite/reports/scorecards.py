@@ -190,7 +190,7 @@ def make(folders: Sequence[pathlib.Path]) -> Scorecard:
       sweep = sweep_results.load(folder)
       actors += _of_sweep(sweep)
       counts = collections.Counter(
-          sweep.family(sweep.runs[one.job.run]) for one in sweep.unfinished
+          sweep.family(sweep.runs[job.run]) for job in sweep.unfinished
       )
       notes += (f'{name}: {n} jobs are missing' for name, n in counts.items())
     else:

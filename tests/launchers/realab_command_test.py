@@ -183,7 +183,7 @@ def test_a_bad_installation(monkeypatch, capsys):
   _processes(monkeypatch, 1, 'Traceback\nImportError: no libmujoco\n')
   monkeypatch.setenv('MUJOCO_GL', 'egl')
   monkeypatch.setitem(
-      doctor.EXTRAS, 'tb', doctor.Extra(('no_such_module',), 'curves')
+      doctor.EXTRAS, 'gym', doctor.Extra(('no_such_module',), 'curves')
   )
   assert doctor.main() == 1
   shown = capsys.readouterr().out
@@ -192,8 +192,8 @@ def test_a_bad_installation(monkeypatch, capsys):
   )
   assert '--  rendering  no camera works: MUJOCO_GL=egl (ImportError' in shown
   assert 'apt install libegl1' in shown
-  assert '--  tb         no_such_module not installed, for curves\n' in shown
-  repair = "python -m pip install -e '.[tb]' -c constraints.txt, in the clone"
+  assert '--  gym        no_such_module not installed, for curves\n' in shown
+  repair = "python -m pip install -e '.[gym]' -c constraints.txt, in the clone"
   assert f'to repair: {repair}\n' in shown
 
 

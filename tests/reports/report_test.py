@@ -110,7 +110,7 @@ def test_unfinished_runs_are_named_and_left_out(tmp_path):
   text = pages.text(page)
   assert '17 of 21 jobs finished' in text
   assert 'This report is preliminary' in text
-  assert 'reward, seed 1: at 4,000 of 20,000 control steps' in text
+  assert 'Jobs without results: reward, seed 1 decoupled, seed 0' in text
   assert 'There are no figures for decoupled: no seed has finished.' in text
   assert pages.cells(page, 'Returns and hacked episodes', 'reward')[2] == '10'
   rows = [
@@ -151,7 +151,7 @@ def test_a_sweep_that_has_only_begun_has_a_report(tmp_path):
   scheduler._describe(one, planned, False, tmp_path)
   text = pages.text(pages.write(tmp_path, tmp_path / 'out'))
   assert 'No learned agent has results yet.' in text
-  assert 'reward.secure, seed 2: not started' in text
+  assert 'reward.secure, seed 2' in text
 
 
 def test_a_world_that_is_not_imported_is_named_before_any_work(

@@ -78,16 +78,9 @@ class RunSpec(validation.Spec):
   twin: bool = False
   steps: _Count | None = None
   num_seeds: _Count | None = None
-  # Left out if it is not given, so that files of earlier versions stay equal.
-  task: _Task | None = pydantic.Field(
-      default=None, exclude_if=lambda task: task is None
-  )
-  data: option_types.FilePath | None = pydantic.Field(
-      default=None, exclude_if=lambda path: path is None
-  )
-  twin_data: option_types.FilePath | None = pydantic.Field(
-      default=None, exclude_if=lambda path: path is None
-  )
+  task: _Task | None = None
+  data: option_types.FilePath | None = None
+  twin_data: option_types.FilePath | None = None
 
   @pydantic.model_validator(mode='after')
   def _check_data(self) -> 'RunSpec':
@@ -154,13 +147,8 @@ class TrainingSpec(validation.Spec):
   curve_every: _Count = 25_000
   sleep: bool = False
   task_kwargs: _TaskKwargs = pydantic.Field(default_factory=dict)
-  # Left out if they are not given, like `task` of a run.
-  tasks: Annotated[tuple[_Task, ...], pydantic.Field(strict=False)] = (
-      pydantic.Field(default=(), exclude_if=lambda tasks: not tasks)
-  )
-  adaptation: _Count | None = pydantic.Field(
-      default=None, exclude_if=lambda steps: steps is None
-  )
+  tasks: Annotated[tuple[_Task, ...], pydantic.Field(strict=False)] = ()
+  adaptation: _Count | None = None
 
   @pydantic.model_validator(mode='after')
   def _check_tasks(self) -> 'TrainingSpec':

@@ -117,7 +117,7 @@ class Job:
         'versions': depends_on,
     }
     if self.policy is None:
-      config['training'] = self.training.model_dump()
+      config['training'] = self.training.to_mapping()
       if tasks := self.training.tasks:
         versions = [_dynamics(experiment.at(task)) for task in tasks]
         config['training']['tasks'] = [
@@ -201,19 +201,6 @@ def read_config(folder: pathlib.Path) -> dict[str, Any]:
     )
   found: dict[str, Any] = config
   return found
-
-
-def is_done(folder: pathlib.Path) -> bool:
-  """Returns True if the job of a folder has finished.
-
-  Raises:
-    ResultsError: If a result or the configuration was changed or removed after
-      that.
-  """
-  if not storage.is_done(folder):
-    return False
-  read_config(folder)
-  return True
 
 
 def plan(

@@ -43,23 +43,12 @@ def stakes_of(
       lock = stack.enter_context(path.with_suffix('.lock').open('w'))
       # A job that needs the same stakes waits here until another has them.
       fcntl.flock(lock, fcntl.LOCK_EX)
-    return _kept(path, key) or _measured(world, design, path)
-
-
-def _kept(path: pathlib.Path, key: str) -> stakes.Stakes | None:
-  """Returns the stakes in a file, or `None` if it has none of this key."""
-  if not path.exists():
-    return None
-  content = storage.read_json(path)
-  kept = validation.validate(stakes.Stakes, content, str(path))
-  return kept if kept.key == key else None
-
-
-def _measured(
-    world: worlds.World, design: specs.DesignSpec, path: pathlib.Path
-) -> stakes.Stakes | None:
-  """Measures stakes, and writes them into a file."""
-  found = judging.stakes_of(world, design)
-  if found is not None:
-    storage.write_json(path, found.model_dump())
-  return found
+    if path.exists():
+      content = storage.read_json(path)
+      kept = validation.validate(stakes.Stakes, content, str(path))
+      if kept.key == key:
+        return kept
+    stake = judging.stakes_of(world, design)
+    if stake is not None:
+      storage.write_json(path, stake.model_dump())
+    return stake

@@ -4,7 +4,6 @@ The same versions and seeds give the same results, bit for bit, if all of these
 properties are equal. Otherwise sums and sines may differ in their last bits.
 """
 
-from collections.abc import Mapping
 import os
 import pathlib
 import platform
@@ -13,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from realab_suite.lab.experiments import storage
 from realab_suite.lab.experiments import threads
 
 # Variables with which libraries choose between implementations of a function.
@@ -39,15 +37,6 @@ def here() -> dict[str, Any]:
       **{name: os.environ.get(name, '') for name in _VARIABLES},
       'XLA_FLAGS': ' '.join(threads.xla_flags()),
   }
-
-
-def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
-  """Returns the entries in which two descriptions differ, or ''."""
-  return '; '.join(
-      storage.difference(there.get(key), here.get(key), key)
-      for key in [*there, *(key for key in here if key not in there)]
-      if there.get(key) != here.get(key)
-  )
 
 
 def _processor() -> str:

@@ -200,11 +200,7 @@ def load(folder: pathlib.Path) -> sweep_results.Sweep:
       published.experiment,
       published.calibration,
       runs,
-      tuple(
-          sweep_results.Unfinished(job, 'not published')
-          for job in published.jobs
-          if job.folder not in published.done
-      ),
+      tuple(job for job in published.jobs if job.folder not in published.done),
       published.audits,
       has_traces=False,
   )

@@ -59,22 +59,15 @@ class Recorded(NamedTuple):
     return self.world.load(self.design, self.row.seed, self.row.world)
 
 
-def first_row(run: sweep_results.Run) -> results.EpisodeResult | None:
-  """Returns the first valid episode of a run, or `None`."""
-  valid = (row for row in run.rows if row.is_valid)
-  return min(valid, key=lambda row: row.key, default=None)
-
-
 def typical_row(run: sweep_results.Run) -> results.EpisodeResult | None:
   """Returns the valid episode of median corruption, or `None`.
 
-  With an even number of episodes, it is the lower one of the middle two.
+  With an even number of episodes, it is the lower one of the middle two. An
+  episode in which no register was read counts as one without corruption.
   """
-  known = [
-      row for row in run.rows if row.is_valid and row.corruption is not None
-  ]
-  known.sort(key=lambda row: (row.corruption or 0.0, *row.key))
-  return known[(len(known) - 1) // 2] if known else None
+  valid = [row for row in run.rows if row.is_valid]
+  valid.sort(key=lambda row: (row.corruption or 0.0, *row.key))
+  return valid[(len(valid) - 1) // 2] if valid else None
 
 
 def words(row: results.EpisodeResult) -> str:

@@ -248,12 +248,8 @@ class _Sweep:
       self._start(run)
 
   def _start(self, run: _Run) -> None:
-    try:
-      if jobs.is_done(run.folder):
-        self._finish(run, '')
-        return
-    except errors.ResultsError as error:
-      self._finish(run, str(error))
+    if (run.folder / storage.DONE).exists():
+      self._finish(run, '')
       return
     command = [
         sys.executable,

@@ -1,4 +1,4 @@
-"""Files and folders of runs, with locks, atomic writes and checksums.
+"""Files and folders of runs, with locks and atomic writes.
 
 A process may be killed at any time. Files are not synchronised with the disk,
 so a power failure may damage them.
@@ -8,11 +8,9 @@ from collections.abc import Iterator, Mapping, Sequence
 import contextlib
 import errno
 import fcntl
-import hashlib
 import json
 import os
 import pathlib
-import re
 from typing import Any, final
 
 from realab_suite import archive
@@ -20,10 +18,9 @@ from realab_suite import errors
 
 CONFIG = 'config.json'
 DONE = 'done.json'
+CHECKPOINT = 'checkpoint.ckpt'
 _LOCK = 'lock'
-_CHECKPOINTS = 'checkpoints'
-_SUFFIX = '.ckpt'
-_KEPT = 2  # Number of checkpoints to keep.
+_ADVICE = '; remove this file, then the same command begins the run again'
 
 
 @contextlib.contextmanager
@@ -172,41 +169,6 @@ def naming(path: pathlib.Path, advice: str = '') -> Iterator[None]:
     raise errors.ResultsError(f'{path}: {error}{advice}') from error
 
 
-def is_done(path: pathlib.Path) -> bool:
-  """Returns True if the run of a folder has finished.
-
-  Raises:
-    ResultsError: If a result was changed or removed after that.
-  """
-  if not (path / DONE).exists():
-    return False
-  for name, digest in read_done(path / DONE).items():
-    if _digest(path / name) != digest:
-      raise errors.ResultsError(
-          f'{path / name}: changed since the run finished; remove {path} to run'
-          ' it again'
-      )
-  return True
-
-
-def read_done(path: pathlib.Path) -> dict[str, str]:
-  """Returns the SHA-256 of each result, by the name of its file.
-
-  Raises:
-    ResultsError: If the file cannot be read or does not list files of a run.
-  """
-  content = read_json(path)
-  files = content.get('files') if isinstance(content, dict) else None
-  if not isinstance(files, dict) or not all(
-      re.fullmatch(r'\w[\w.-]*', name) for name in files
-  ):
-    raise errors.ResultsError(
-        f'{path}: files must be names of files of the run; remove'
-        f' {path.parent} to run it again'
-    )
-  return files
-
-
 @final
 class RunFolder:
   """Folder of one run, which only one process may use; see `locked`."""
@@ -222,73 +184,50 @@ class RunFolder:
     if not (path / CONFIG).exists():
       write_json(path / CONFIG, config)
 
-  def finish(self, names: Sequence[str], facts: Mapping[str, Any]) -> None:
-    """Marks the run as finished, and removes its checkpoints.
+  @property
+  def is_done(self) -> bool:
+    """True if the run has finished."""
+    return (self.path / DONE).exists()
+
+  def finish(self, facts: Mapping[str, Any]) -> None:
+    """Marks the run as finished, records facts, and removes its checkpoint."""
+    write_json(self.path / DONE, facts)
+    with explained(self._checkpoint):
+      self._checkpoint.unlink(missing_ok=True)
+
+  @property
+  def _checkpoint(self) -> pathlib.Path:
+    return self.path / CHECKPOINT
+
+  def save(self, header: Mapping[str, Any], contents: Any) -> None:
+    """Writes a checkpoint, which replaces the last one.
 
     Args:
-      names: Names of the files with results.
-      facts: Further facts to record.
-    """
-    files = {name: _digest(self.path / name) for name in names}
-    write_json(self.path / DONE, {**facts, 'files': files})
-    for checkpoint in self._checkpoints():
-      with explained(checkpoint):
-        checkpoint.unlink()
-
-  def save(self, step: int, header: Mapping[str, Any], contents: Any) -> None:
-    """Writes a checkpoint, and removes all but the last two.
-
-    Args:
-      step: Number of control steps so far.
       header: Header that `load` compares.
       contents: Tuples, lists and dicts of arrays, numbers, texts and `None`.
 
     Raises:
-      ResultsError: If it cannot be written. Earlier checkpoints are kept.
+      ResultsError: If it cannot be written. The last one is kept.
     """
-    folder = self.path / _CHECKPOINTS
-    with explained(folder):
-      folder.mkdir(exist_ok=True)
-    path = folder / f'{step:012d}{_SUFFIX}'
-    write_archive(path, header, contents)
-    self._remove_old()
+    write_archive(self._checkpoint, header, contents)
 
   def load(self, header: Mapping[str, Any]) -> Any:
-    """Returns the contents of the last checkpoint, or `None`.
+    """Returns the contents of the checkpoint, or `None` without one.
 
     Raises:
-      ResultsError: If it is damaged or belongs to another run. An older
-        checkpoint is never used instead; the message explains how to.
+      ResultsError: If it is damaged or belongs to another run.
     """
-    checkpoints = self._checkpoints()
-    if not checkpoints:
+    if not self._checkpoint.exists():
       return None
-    contents = read_archive(checkpoints[-1], header, self._advice())
-    # The process that wrote it may have been killed before the removal.
-    self._remove_old()
-    return contents
+    return read_archive(self._checkpoint, header, _ADVICE)
 
   def naming_checkpoint(self) -> contextlib.AbstractContextManager[None]:
     """Returns a context in which a checkpoint is restored.
 
-    An error about a state that does not fit then names the last checkpoint, and
-    says to remove it.
+    An error about a state that does not fit then names the checkpoint, and says
+    to remove it.
     """
-    return naming(self._checkpoints()[-1], self._advice())
-
-  def _advice(self) -> str:
-    *older, _ = self._checkpoints()
-    where = f'from {older[-1].name}' if older else 'from the beginning'
-    return f'; remove this file, then the same command continues {where}'
-
-  def _remove_old(self) -> None:
-    for old in self._checkpoints()[:-_KEPT]:
-      with explained(old):
-        old.unlink()
-
-  def _checkpoints(self) -> list[pathlib.Path]:
-    """Returns the checkpoints, from the oldest to the latest."""
-    return sorted((self.path / _CHECKPOINTS).glob(f'*{_SUFFIX}'))
+    return naming(self._checkpoint, _ADVICE)
 
 
 @final
@@ -354,8 +293,3 @@ def difference(there: Any, here: Any, key_path: str = '') -> str:
         inner = f'{key_path}.{key}' if key_path else key
         return difference(there.get(key), here.get(key), inner)
   return f'{key_path} is {there!r:.60} there, {here!r:.60} here'
-
-
-def _digest(path: pathlib.Path) -> str:
-  with explained(path), open(path, 'rb') as file:
-    return hashlib.file_digest(file, 'sha256').hexdigest()

@@ -9,7 +9,7 @@ import dataclasses
 import functools
 import json
 import pathlib
-from typing import Annotated, Any, Final, NamedTuple, final
+from typing import Annotated, Any, Final, final
 
 import pydantic
 
@@ -61,14 +61,6 @@ class _Description(pydantic.BaseModel):
   experiment: str
   calibration: bool
   jobs: list[Job] = pydantic.Field(min_length=1)
-
-
-@final
-class Unfinished(NamedTuple):
-  """A job without results, and how far it is, as text."""
-
-  job: Job
-  how_far: str
 
 
 @final
@@ -156,29 +148,29 @@ class Run:
   @functools.cached_property
   def curves(self) -> dict[int, list[dict[str, Any]]]:
     """Learning curve of each seed; empty for a scripted policy."""
-    if self.is_scripted:
-      return {}
-    return {seed: self.lines(seed, training.CURVE) for seed in self.configs}
+    return self._lines_by_seed(training.CURVE)
 
   @functools.cached_property
   def timing(self) -> dict[int, list[dict[str, Any]]]:
     """Training times of each seed; empty for a scripted policy."""
-    if self.is_scripted:
-      return {}
-    return {seed: self.lines(seed, training.TIMING) for seed in self.configs}
+    return self._lines_by_seed(training.TIMING)
 
   def training_episodes(self) -> dict[int, list[dict[str, Any]]]:
     """Returns the record of each training episode, by seed."""
-    if self.is_scripted:
-      return {}
     return {
         seed: [
             record
-            for record in self.lines(seed, training.TRAINING_EPISODES)
+            for record in records
             for _ in range(record.get('num_episodes', 1))
         ]
-        for seed in self.configs
+        for seed, records in self._lines_by_seed(
+            training.TRAINING_EPISODES
+        ).items()
     }
+
+  def _lines_by_seed(self, name: str) -> dict[int, list[dict[str, Any]]]:
+    seeds = () if self.is_scripted else self.configs
+    return {seed: self.lines(seed, name) for seed in seeds}
 
   @functools.cached_property
   def traces(self) -> dict[int, dict[str, Any]]:
@@ -210,7 +202,7 @@ class Sweep:
   experiment: Mapping[str, Any]
   is_calibration: bool
   runs: Mapping[str, Run]
-  unfinished: tuple[Unfinished, ...]
+  unfinished: tuple[Job, ...]
   audits: Mapping[str, Any]
   has_traces: bool = True
 
@@ -278,19 +270,18 @@ def load(folder: pathlib.Path) -> Sweep:
     raise errors.ResultsError(
         f'{path}: {key_path or "contents"}: {first["msg"]}'
     ) from error
-  experiment = loading.read_mapping(folder / scheduler.EXPERIMENT)
   planned: dict[str, list[Job]] = {}
   for job in description.jobs:
     planned.setdefault(job.run, []).append(job)
   unfinished = tuple(
-      Unfinished(job, _how_far(job, folder / job.folder, experiment))
+      job
       for of_run in planned.values()
       for job in of_run
       if not (folder / job.folder / storage.DONE).exists()
   )
   return Sweep(
       folder,
-      experiment,
+      loading.read_mapping(folder / scheduler.EXPERIMENT),
       description.calibration,
       {name: _run(folder, name, of_run) for name, of_run in planned.items()},
       unfinished,
@@ -358,7 +349,6 @@ def _run(folder: pathlib.Path, name: str, planned: Sequence[Job]) -> Run:
     if (path / training.STAGES).exists():
       names = (f'{job.run}.{stage}' for stage in jobs.STAGES)
       stages += _rows(path / training.STAGES, *names)
-    jobs.is_done(path)
     folders[job.seed] = path
     configs[job.seed] = jobs.read_config(path)
   check_stakes(folder, name, rows)
@@ -412,27 +402,3 @@ def check_stakes(
         f' {", ".join(keys)}; allowed is one key, so run it again in another'
         ' folder'
     )
-
-
-def _how_far(
-    job: Job, path: pathlib.Path, experiment: Mapping[str, Any]
-) -> str:
-  """Returns the progress of a job, according to its complete records."""
-  if not path.exists():
-    return 'not started'
-  steps = 0
-  if (path / training.CURVE).exists():
-    with storage.explained(path / training.CURVE):
-      lines = (path / training.CURVE).read_bytes().splitlines()
-    for line in lines[-2:]:  # The last line of a running job may be incomplete.
-      try:
-        steps = int(json.loads(line)['step'])
-      except (ValueError, KeyError, TypeError):
-        continue
-  if not steps:
-    return 'started, not finished'
-  # Names of twins and baselines begin with that of their run.
-  name, _, _ = job.run.partition('.')
-  total = experiment['runs'][name]['steps'] or experiment['training']['steps']
-  total += experiment['training'].get('adaptation', 0)
-  return f'at {steps:,} of {total:,} control steps'

@@ -12,7 +12,6 @@ import os
 import pathlib
 from typing import TYPE_CHECKING, Any, final
 
-from absl import logging
 import dm_env
 import numpy as np
 
@@ -51,7 +50,6 @@ TRACE = 'trace.bin'
 TRANSPLANT = 'transplant.jsonl'
 # Episodes before adaptation, if there is one.
 STAGES = 'stages.jsonl'
-TENSORBOARD = 'tensorboard'
 _CHECKPOINT = 'checkpoint'
 
 # Called with messages for the user; they do not affect results.
@@ -65,12 +63,10 @@ class Options:
 
   Attributes:
     say: Called with messages for the user.
-    tensorboard: True to write learning curves for TensorBoard as well.
     parent: Process whose end also ends the job, or `None`.
   """
 
   say: Say
-  tensorboard: bool = False
   parent: int | None = None
 
   def check_parent(self) -> None:
@@ -97,18 +93,15 @@ def run(job: jobs.Job, output: pathlib.Path, options: Options) -> pathlib.Path:
     RealabError: If the job is invalid, its folder belongs to another one, a
       checkpoint is damaged or the disk is full.
   """
-  if options.tensorboard:
-    progress.check_tensorboard()
   options.check_parent()
   path = output / job.folder()
   with storage.locked(path):
     folder = storage.RunFolder(path, job.config())
     jobs.read_config(path)  # Refuses another configuration.
-    if storage.is_done(path):
+    if folder.is_done:
       options.say(f'{path} has finished already')
       return path
     learner = None
-    files = [EPISODES, TRACE]
     facts: dict[str, Any] = {
         'machines': [{'step': 0, 'machine': machines.here()}]
     }
@@ -118,16 +111,12 @@ def run(job: jobs.Job, output: pathlib.Path, options: Options) -> pathlib.Path:
       storage.write_archive(
           path / LEARNER, header(job.digest(), LEARNER), state
       )
-      files += [CURVE, TRAINING_EPISODES, LEARNER]
-      if job.training.tasks:
-        files.append(STAGES)
     rows = _evaluate(job, learner, path / TRACE, output)
     storage.write_whole(path / EPISODES, rows)
     if job.embedded is not None:
       rows = _evaluate(job.transplant, learner, None, output)
       storage.write_whole(path / TRANSPLANT, rows)
-      files.append(TRANSPLANT)
-    folder.finish(files, facts)
+    folder.finish(facts)
   options.say(f'Results are in {path}')
   return path
 
@@ -240,11 +229,6 @@ def load_learner(
     ResultsError: If the learner is missing, damaged or belongs to another job.
   """
   file = path / LEARNER
-  if not file.exists():
-    raise errors.ResultsError(
-        f'{file}: missing; a packed sweep has the learners only if it was'
-        ' packed with --learners'
-    )
   state = storage.read_archive(file, header(job.digest(), LEARNER))
   learner = make_learner(job, batch)
   with storage.naming(file):
@@ -388,31 +372,19 @@ class _Training:
       step, total = (n * self._num_envs for n in (self._done, self._total))
       name = f'{job.run}, seed {job.seed}'
       display = progress.Display(name, step, total, self._options.say)
-      stack.callback(display.close)
-      if self._options.tensorboard:
-        display.write_tensorboard(path / TENSORBOARD)
       self._learn(learner, time_step, display)
     return learner, {'steps': total, 'machines': self._machines}
 
   def _add_machine(
       self, learner: 'agents.Learner', saved: Mapping[str, Any] | None
   ) -> None:
-    """Records the machine, unless it is that of the last checkpoint.
-
-    Results then depend on both machines, so a warning is logged.
-    """
+    """Records the machine, unless it is that of the last checkpoint."""
     here = {**machines.here(), **learner.settings()}
-    step = self._done * self._num_envs
     if saved is not None:
       self._machines = saved['machines']
-      differences = machines.differences(self._machines[-1]['machine'], here)
-      if not differences:
+      if self._machines[-1]['machine'] == here:
         return
-      logging.warning(
-          '%s, seed %d: continues from step %d on another machine or with other'
-          ' settings, and its results depend on both: %s',
-          self._job.run, self._job.seed, step, differences,
-      )  # fmt: skip
+    step = self._done * self._num_envs
     self._machines = [*self._machines, {'step': step, 'machine': here}]
 
   def _restore(
@@ -467,7 +439,6 @@ class _Training:
         time_step, actions = self._recorded.at(self._done)
         learner.watch(time_step, actions)
         self._done += 1
-      display.advance(self._num_envs)
       is_over = self._done == self._total
       if is_over or self._done % self._point_every == 0:
         step = self._done * self._num_envs
@@ -530,7 +501,6 @@ class _Training:
     elif self._recorded is None:
       world = np.frombuffer(self._batch.save().to_bytes(), np.uint8)
     self._folder.save(
-        self._done * self._num_envs,
         header(self._job.digest(), _CHECKPOINT),
         {
             'done': self._done,

@@ -83,8 +83,8 @@ def build(
         line = json.dumps({'step': 4000, 'true_return': 1.0})
         (run.path / training.CURVE).write_text(f'{line}\n{{"step": 60')
         continue
-      names = _write(run.path, job, rng)
-      run.finish(names, {})
+      _write(run.path, job, rng)
+      run.finish({})
   return folder
 
 
@@ -96,7 +96,7 @@ def _levels(job: jobs.Job, rng: Any) -> np.ndarray:
   return np.array(levels) * np.exp(rng.normal(scale=0.12))
 
 
-def _write(path: pathlib.Path, job: jobs.Job, rng: Any) -> list[str]:
+def _write(path: pathlib.Path, job: jobs.Job, rng: Any) -> None:
   levels = _levels(job, rng)
   count = job.experiment.evaluation.episodes
   rows = [_row(job, levels, world, rng) for world in range(count)]
@@ -105,13 +105,11 @@ def _write(path: pathlib.Path, job: jobs.Job, rng: Any) -> list[str]:
   header = training.header(job.digest(), training.TRACE)
   trace = _trace(job, rows, rng)
   storage.write_archive(path / training.TRACE, header, trace)
-  names = [training.EPISODES, training.TRACE]
   if job.embedded is not None:
     bumps = np.array([14.0, 0.02, 0.01])
     rows = [_row(job.transplant, bumps, world, rng) for world in range(count)]
     data = b''.join(results.line(row) for row in rows)
     (path / training.TRANSPLANT).write_bytes(data)
-    names.append(training.TRANSPLANT)
   if job.policy is None and job.training.tasks:
     rows = [
         _row(job.at_stage(stage, task), np.array(low), world, rng)
@@ -123,10 +121,8 @@ def _write(path: pathlib.Path, job: jobs.Job, rng: Any) -> list[str]:
     ]
     data = b''.join(results.line(row) for row in rows)
     (path / training.STAGES).write_bytes(data)
-    names.append(training.STAGES)
   if job.policy is None:
-    names += _write_training(path, job, levels, rng)
-  return names
+    _write_training(path, job, levels, rng)
 
 
 def register(

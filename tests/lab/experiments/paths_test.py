@@ -89,13 +89,6 @@ def _load_sweep(folder: str) -> Any:
   return sweep_results.load(sweep)
 
 
-def _load_done(name: str) -> Any:
-  folder = pathlib.Path('done')
-  folder.mkdir(exist_ok=True)
-  storage.write_json(folder / storage.DONE, {'files': {name: '0' * 64}})
-  return storage.is_done(folder)
-
-
 def _run_scripted(**changes: Any) -> Any:
   return scripted.run(small.settings(pathlib.Path(), **changes), str)
 
@@ -123,7 +116,6 @@ _USES: dict[str, Callable[[str], Any]] = {
     'kind of a register': lambda path: _load_world(kind=path),
     'option of a register': lambda path: _load_world(options={'file': path}),
     'folder of a job': _load_sweep,
-    'result of a run': _load_done,
     '--run': lambda path: jobs.plan(
         experiment_specs.load(_experiment()), [0], [path]
     ),

@@ -79,16 +79,6 @@ def test_what_is_no_json_is_named(tmp_path, text):
     storage.read_json(path)
 
 
-def test_all_checkpoints_but_two_are_removed_and_the_last_is_loaded(tmp_path):
-  run = storage.RunFolder(tmp_path, {})
-  assert run.load(_HEADER) is None
-  for step in (1, 2, 3):
-    run.save(step, _HEADER, {'step': step})
-  assert run.load(_HEADER) == {'step': 3}
-  names = sorted(p.name for p in (tmp_path / 'checkpoints').iterdir())
-  assert names == ['000000000002.ckpt', '000000000003.ckpt']
-
-
 def test_the_first_difference_is_named_by_its_place():
   there = {'a': {'b': 1, 'c': 2}}
   assert storage.difference(there, {'a': {'b': 1, 'c': 3}}) == (

@@ -243,7 +243,7 @@ def test_an_interrupted_sweep_leaves_no_process_behind(tmp_path):
       cwd=_ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
   ) as process:  # fmt: skip
     patience.until(
-        lambda: list(output.glob('*/checkpoints/*.ckpt'))
+        lambda: list(output.glob('*/checkpoint.ckpt'))
         or process.poll() is not None
     )
     assert process.poll() is None, process.stderr.read()
@@ -254,7 +254,7 @@ def test_an_interrupted_sweep_leaves_no_process_behind(tmp_path):
       process.kill()
   assert process.returncode == 130
   assert complaint.splitlines()[-1].startswith('error: interrupted')
-  [folder] = [p.parent for p in output.glob('*/checkpoints')]
+  [folder] = [p.parent for p in output.glob('*/checkpoint.ckpt')]
   pid = int((folder / 'lock').read_text())
   with pytest.raises(ProcessLookupError):
     os.kill(pid, 0)

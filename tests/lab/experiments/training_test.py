@@ -190,9 +190,8 @@ def test_a_run_leaves_the_documented_files(whole, tmp_path):
   job, path = _job(), shutil.copytree(whole, tmp_path / whole.name)
   assert path.name == job.folder()
   assert {p.name for p in path.iterdir()} == {
-      *_RESULTS, training.TIMING, 'lock', 'checkpoints',
+      *_RESULTS, training.TIMING, 'lock',
   }  # fmt: skip
-  assert list((path / 'checkpoints').iterdir()) == []
   assert json.loads((path / storage.CONFIG).read_text()) == job.config()
   rows = list(results.read_rows(path / training.EPISODES))
   # The episodes of training have another seed.
@@ -287,15 +286,8 @@ def test_every_machine_of_a_run_is_recorded_once(tmp_path, monkeypatch, caplog):
   for processor, step in (('b', 25), ('c', 24), ('b', 26), ('a', 45)):
     use(processor)
     _kill(job, tmp_path, monkeypatch, step)
-  caplog.clear()
   use('b')
   path, _ = _run(job, tmp_path)
-  [warning] = [one.message for one in caplog.records]
-  assert warning == (
-      'reward, seed 3: continues from step 160 on another machine or with other'
-      " settings, and its results depend on both: processor is 'a' there, 'b'"
-      ' here'
-  )
   done = json.loads((path / storage.DONE).read_text())
   found = [
       (one['step'], one['machine']['processor']) for one in done['machines']
@@ -368,27 +360,20 @@ def test_a_folder_of_another_configuration_is_refused(tmp_path):
   assert {p.name for p in path.iterdir()} == {storage.CONFIG, 'lock'}
 
 
-def _checkpoints(path):
-  return sorted((path / 'checkpoints').iterdir())
-
-
-def test_a_run_continues_from_the_checkpoint_before_a_damaged_one(
+def test_a_damaged_checkpoint_is_refused_until_it_is_removed(
     whole, tmp_path, monkeypatch
 ):
   job = _job()
   _kill(job, tmp_path, monkeypatch, 45)
   path = tmp_path / job.folder()
-  first, last = _checkpoints(path)
+  last = path / storage.CHECKPOINT
   data = last.read_bytes()
   last.write_bytes(data[: len(data) // 2])
   with pytest.raises(errors.ResultsError) as raised:
     _run(job, tmp_path)
   message = str(raised.value)
   assert message.startswith(f'{last}: ')
-  assert (
-      f'remove this file, then the same command continues from {first.name}'
-      in (message)
-  )
+  assert 'remove this file, then the same command begins the run' in message
   last.unlink()
   _run(job, tmp_path)
   assert _results(path) == _results(whole)
@@ -413,7 +398,7 @@ def test_a_full_disk_is_reported_and_nothing_is_lost(
     ):
       _run(job, tmp_path)
   assert not list(path.rglob('*.partial'))
-  assert _checkpoints(path)
+  assert (path / storage.CHECKPOINT).exists()
   _run(job, tmp_path)
   assert _results(path) == _results(whole)
 
@@ -421,9 +406,9 @@ def test_a_full_disk_is_reported_and_nothing_is_lost(
 def test_files_of_another_run_are_refused_by_name(whole, tmp_path, monkeypatch):
   job, other = _job(), _job(num_envs=2)
   _kill(other, tmp_path, monkeypatch, 45)
-  theirs = _checkpoints(tmp_path / other.folder())[-1].read_bytes()
+  theirs = (tmp_path / other.folder() / storage.CHECKPOINT).read_bytes()
   _kill(job, tmp_path, monkeypatch, 45)
-  path = _checkpoints(tmp_path / job.folder())[-1]
+  path = tmp_path / job.folder() / storage.CHECKPOINT
   for data, problem in (
       (theirs, "holds 'checkpoint' with another header: configuration is"),
       ((whole / training.LEARNER).read_bytes(), "holds 'learner.bin'; expec"),
