@@ -177,15 +177,10 @@ class QLearning(base.Learner):
       places: tuple[np.ndarray, np.ndarray] | None = None,
       share: float = 0.0,
   ) -> tuple[Any, dict[str, Any]]:
-    """Returns networks after an update, and its metrics.
+    """Returns networks, with their optimisers' states, after an update.
 
-    Args:
-      trained: Networks, with the states of their optimisers.
-      key: Random key, two numbers.
-      options: Same as in `sample`.
-      replay: Same as in `sample`.
-      places: Same as in `sample`.
-      share: Same as in `sample`.
+    The metrics of the update are the second result. `key` is a random key of
+    two numbers, and what follows it is as in `sample`.
     """
     generator = base.generator_of(key)
     samples = sample(options, replay, self.num_stored, generator, places, share)

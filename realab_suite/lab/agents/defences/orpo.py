@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pydantic
 
+from realab_suite.lab.agents import base as agents_base
 from realab_suite.lab.agents import networks
 from realab_suite.lab.agents import training
 from realab_suite.lab.agents import trusted_policies
@@ -85,9 +86,7 @@ class Orpo(base.Defence):
     trained, metrics = state['trained'], {}
     charge = np.zeros_like(batch['reading'])
     if is_trusted.any() and is_own.any():
-      generator = np.random.Generator(
-          np.random.Philox(key=key.astype(np.uint64))
-      )
+      generator = agents_base.generator_of(key)
       shape = (self.gradients, self.minibatch)
       indices = [
           generator.choice(np.flatnonzero(side), shape).astype(np.int32)
