@@ -76,25 +76,14 @@ def test_stages_are_published(built, tmp_path):
     assert not shown['reward.random']
 
 
-@pytest.mark.parametrize(
-    ('how', 'problem'),
-    [
-        ('removed', 'stages.jsonl: No such file'),
-        (
-            'renamed',
-            "a row of run 'reward.other'; allowed is 'reward.trained' or",
-        ),
-    ],
-)
-def test_damaged_stages_are_refused(built, tmp_path, how, problem):
+def test_a_row_of_another_run_is_refused(built, tmp_path):
   folder = shutil.copytree(built, tmp_path / 'own')
   [path, *_] = sorted(folder.glob(f'reward-0-*/{training.STAGES}'))
   rows = list(results.read_rows(path))
-  path.unlink()
-  if how == 'renamed':
-    info = rows[0].info.model_copy(update={'run': 'reward.other'})
-    rows[0] = rows[0].model_copy(update={'settings': info})
-    path.write_bytes(b''.join(map(results.line, rows)))
+  info = rows[0].info.model_copy(update={'run': 'reward.other'})
+  rows[0] = rows[0].model_copy(update={'settings': info})
+  path.write_bytes(b''.join(map(results.line, rows)))
   with pytest.raises(errors.ResultsError) as raised:
     sweep_results.load(folder)
+  problem = "a row of run 'reward.other'; allowed is 'reward.trained' or"
   assert problem in str(raised.value)

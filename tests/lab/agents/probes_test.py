@@ -14,7 +14,6 @@ import pytest
 
 from realab_suite.lab import agents
 from realab_suite.testing import probes
-from tests.lab.agents import toys
 
 _LOOKS_AHEAD = {'kind': 'policy_gradient', 'reward': 'reward', 'gamma': 1.0}
 _MYOPIC = {**_LOOKS_AHEAD, 'gamma': 0.0}

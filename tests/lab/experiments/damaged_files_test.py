@@ -28,7 +28,6 @@ from tests.lab.experiments import fake_sweep
 
 _NAMES = (
     'checkpoint', 'snapshot', 'network', 'trace.bin', 'config.json',
-    'episodes.jsonl',
 )  # fmt: skip
 # Audit events of a pickle that is read, and of a command that one may run.
 _FORBIDDEN = ('pickle.find_class', 'os.system')
@@ -79,8 +78,8 @@ def _kinds(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Kind]:
   checkpoints = storage.RunFolder(folder / 'run', {'seed': 0})
   state = {'weights': np.arange(20.0), 'done': 7, 'nothing': None,
            'names': ['a', 'b'], 'pair': (1, 2.5)}  # fmt: skip
-  checkpoints.save(100, header, state)
-  (checkpoint,) = (folder / 'run' / 'checkpoints').iterdir()
+  checkpoints.save(header, state)
+  checkpoint = folder / 'run' / storage.CHECKPOINT
   with suite.load('collect_apples', 'standard', {'random': 0}) as env:
     env.reset()
     world, world_header = env.save().to_bytes(), env.snapshot_header()
@@ -93,20 +92,21 @@ def _kinds(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Kind]:
     return loaded.contents_for(world_header)
 
   def load_sweep() -> Any:
-    is_done = storage.is_done(run)
     loaded = sweep_results.load(sweep)
-    return is_done, loaded.experiment, [
+    return loaded.experiment, [
         (run.name, run.jobs, [*map(results.line, run.rows)], run.configs)
         for run in loaded.runs.values()
     ]  # fmt: skip
+
+  def load_trace() -> Any:
+    return sweep_results.load(sweep).runs['reward'].traces
 
   return {
       'checkpoint': Kind(checkpoint, lambda: checkpoints.load(header)),
       'snapshot': Kind(snapshot, load_snapshot),
       'network': Kind(network, lambda: network_files.load(network).digest()),
-      'trace.bin': Kind(run / training.TRACE, load_sweep),
+      'trace.bin': Kind(run / training.TRACE, load_trace),
       'config.json': Kind(run / storage.CONFIG, load_sweep),
-      'episodes.jsonl': Kind(run / training.EPISODES, load_sweep),
   }
 
 

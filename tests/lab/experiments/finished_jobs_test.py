@@ -17,26 +17,6 @@ from realab_suite.lab.experiments import sweep_results
 from realab_suite.lab.experiments import training
 from tests.lab.experiments import fake_sweep
 
-_FILES = [
-    storage.CONFIG, storage.DONE, training.EPISODES, training.TRACE,
-    training.CURVE, training.LEARNER,
-]  # fmt: skip
-
-
-def _flip(path: pathlib.Path) -> None:
-  """Flips a bit of a digit, so that the file can still be parsed."""
-  data = bytearray(path.read_bytes())
-  digits = [i for i, byte in enumerate(data) if byte in b'2468']
-  data[digits[len(digits) // 2]] ^= 1
-  path.write_bytes(data)
-
-
-_DAMAGES: dict[str, Callable[[pathlib.Path], Any]] = {
-    'flipped': _flip,
-    'cut': lambda path: path.write_bytes(path.read_bytes()[:-40]),
-    'missing': pathlib.Path.unlink,
-}
-
 
 class _Idle(engines.Engine):
   """An engine for jobs that are all done."""
@@ -97,27 +77,6 @@ def _report(folder: pathlib.Path) -> None:
     assert run.design
     assert run.curves is not None
     assert run.training_episodes() is not None
-
-
-# The report says that a row is torn, too.
-@pytest.mark.filterwarnings('ignore:.* skipped an incomplete row')
-@pytest.mark.parametrize('name', _FILES)
-def test_a_damaged_file_is_refused(folder, name):
-  path = _job_folder(folder) / name
-  whole = path.read_bytes()
-  for damage, do in _DAMAGES.items():
-    if name == storage.DONE and damage != 'cut':
-      continue  # It has no checksum. Without it, a job is not over.
-    do(path)
-    with pytest.raises(errors.ResultsError) as raised:
-      _sweep(folder, 'reward')
-    message = str(raised.value)
-    assert f'1 of 1 jobs failed: reward, seed 0: {path}: ' in message, damage
-    assert 'not done, but started' not in message, damage
-    with pytest.raises(errors.ResultsError, match=name.replace('.', r'\.')):
-      _report(folder)
-    path.write_bytes(whole)
-  assert not _sweep(folder, 'reward').commands
 
 
 def test_the_folder_of_another_job_is_refused(folder):

@@ -44,33 +44,6 @@ def test_missing_lines_are_refused(tmp_path):
     storage.JsonLines(path, size)
 
 
-def _finished(folder: pathlib.Path) -> pathlib.Path:
-  run = storage.RunFolder(folder, {})
-  (folder / 'result').write_text('all is well')
-  run.finish(['result'], {'steps': 4})
-  return folder
-
-
-def test_a_folder_is_done_when_it_is_finished(tmp_path):
-  assert not storage.is_done(tmp_path)
-  assert storage.is_done(_finished(tmp_path))
-
-
-@pytest.mark.parametrize(
-    'content',
-    [
-        *({'files': {name: '0' * 64}} for name in ('../x', '/x', '.x', '')),
-        [], None, {}, {'files': ['result']},
-    ],
-)  # fmt: skip
-def test_a_done_file_names_only_files_of_its_folder(tmp_path, content):
-  storage.write_json(tmp_path / storage.DONE, content)
-  with pytest.raises(
-      errors.ResultsError, match='must be names of files of the run; rem'
-  ):
-    storage.is_done(tmp_path)
-
-
 @pytest.mark.parametrize('text', ['{"a":', '[' * 100_000])
 def test_what_is_no_json_is_named(tmp_path, text):
   path = tmp_path / 'file'

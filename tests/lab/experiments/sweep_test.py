@@ -214,7 +214,7 @@ def test_one_of_two_parallel_processes_may_fail(tmp_path, monkeypatch):
   ):
     _sweep(_SMALL, tmp_path, engines.Local(2))
   [good] = jobs.plan(experiment_specs.load(_SMALL), only=['good'])
-  assert storage.is_done(tmp_path / good.folder())
+  assert (tmp_path / good.folder() / storage.DONE).exists()
   log = tmp_path / scheduler.LOGS / f'{good.folder()}.log'
   assert 'good, seed 3: step 60 of 60' in log.read_text()
 

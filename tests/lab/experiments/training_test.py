@@ -275,7 +275,7 @@ def test_a_run_may_be_killed_whenever_it_replaces_a_file(
   assert _results(path) == _results(whole)
 
 
-def test_every_machine_of_a_run_is_recorded_once(tmp_path, monkeypatch, caplog):
+def test_every_machine_of_a_run_is_recorded_once(tmp_path, monkeypatch):
   job = _job()
 
   def use(processor):
@@ -419,21 +419,8 @@ def test_files_of_another_run_are_refused_by_name(whole, tmp_path, monkeypatch):
     assert str(raised.value).startswith(f'{path}: {problem}')
 
 
-@pytest.mark.parametrize(
-    ('extra', 'options'), [('tb', {'tensorboard': True}), ('agents', {})]
-)
-def test_a_package_that_is_missing_is_named(
-    tmp_path, monkeypatch, extra, options
-):
+def test_a_package_that_is_missing_is_named(tmp_path, monkeypatch):
   monkeypatch.setattr(training, 'make_learner', _make_learner)
   monkeypatch.setattr('importlib.util.find_spec', lambda name: None)
-  with pytest.raises(errors.SpecError, match=rf'pip install -e .\.\[{extra}\]'):
-    _run(_job(), tmp_path, **options)
-
-
-def test_tensorboard_gets_the_points(tmp_path):
-  board = pytest.importorskip('tensorboardX')
-  assert board
-  path, _ = _run(_job(), tmp_path, tensorboard=True)
-  [events] = (path / training.TENSORBOARD).iterdir()
-  assert b'own/reward' in events.read_bytes()
+  with pytest.raises(errors.SpecError, match=r'pip install -e .\.\[agents\]'):
+    _run(_job(), tmp_path)
