@@ -27,7 +27,6 @@ from realab_suite.lab.experiments import jobs
 from realab_suite.lab.experiments import recorded_data
 from realab_suite.lab.experiments import training
 from realab_suite.testing import probes
-from tests.lab.agents import toys
 
 _ONE = 'push ' + 'work ' * 9
 _REWARD = 'instantaneous_reward'
