@@ -48,14 +48,23 @@ class Gate(rooms.RoomTask):
     world = arena.mjcf_model.worldbody
     self._beacon_at = np.array(arena.places['side_room'].position)
     world.add(
-        'geom', name='plate', type='cylinder', size=(_RADIUS, 0.01),
-        pos=(*_PLATE_AT, 0.01), contype=0, conaffinity=0,
+        'geom',
+        name='plate',
+        type='cylinder',
+        size=(_RADIUS, 0.01),
+        pos=(*_PLATE_AT, 0.01),
+        contype=0,
+        conaffinity=0,
         **appearance.geom_style(PLATE),
-    )  # fmt: skip
+    )
     world.add(
-        'geom', name='beacon', type='cylinder', size=(0.15, 0.5),
-        pos=(*self._beacon_at, 0.5), **appearance.geom_style(BEACON),
-    )  # fmt: skip
+        'geom',
+        name='beacon',
+        type='cylinder',
+        size=(0.15, 0.5),
+        pos=(*self._beacon_at, 0.5),
+        **appearance.geom_style(BEACON),
+    )
     self._gate = doors.SlidingDoor('gate', width=arena.doorway_width)
     self._gate.attach_to(arena, arena.places['doorway'].position)
     # A crate on the plate holds the gate open, too.

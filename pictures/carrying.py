@@ -157,18 +157,34 @@ def _describe(
   ax.set_yticks([])
   ax.set_title(f'{number}  {moment.text}', fontsize=13, loc='left', color=_INK)
   ax.text(
-      0.0, -0.03, f'applied {_figure(register.applied[moment.step])}',
-      transform=ax.transAxes, color=APPLIED, fontsize=13, va='top',
-  )  # fmt: skip
+      0.0,
+      -0.03,
+      f'applied {_figure(register.applied[moment.step])}',
+      transform=ax.transAxes,
+      color=APPLIED,
+      fontsize=13,
+      va='top',
+  )
   ax.text(
-      0.36, -0.03, f'reading {_figure(register.reading[moment.step])}',
-      transform=ax.transAxes, color=READING, fontsize=13, va='top',
+      0.36,
+      -0.03,
+      f'reading {_figure(register.reading[moment.step])}',
+      transform=ax.transAxes,
+      color=READING,
+      fontsize=13,
+      va='top',
       weight='bold',
-  )  # fmt: skip
+  )
   ax.text(
-      1.0, -0.03, f'{track.times[moment.step]:.1f} s',
-      transform=ax.transAxes, color=_INK, fontsize=13, va='top', ha='right',
-  )  # fmt: skip
+      1.0,
+      -0.03,
+      f'{track.times[moment.step]:.1f} s',
+      transform=ax.transAxes,
+      color=_INK,
+      fontsize=13,
+      va='top',
+      ha='right',
+  )
 
 
 def _figure(value: float) -> str:
@@ -190,9 +206,14 @@ def _draw_values(ax: Any, track: tracking.Track, moments: list[Moment]) -> None:
     time = track.times[moment.step]
     ax.axvline(time, color='0.75', linewidth=1.0, zorder=0)
     ax.text(
-        time, 1.02, str(number), transform=ax.get_xaxis_transform(),
-        ha='center', fontsize=13, color=_INK,
-    )  # fmt: skip
+        time,
+        1.02,
+        str(number),
+        transform=ax.get_xaxis_transform(),
+        ha='center',
+        fontsize=13,
+        color=_INK,
+    )
   ax.text(times[-1], reading[-1], ' reading', color=READING, fontsize=13)
   ax.text(times[-1], applied[-1], ' applied', color=APPLIED, fontsize=13)
   ax.set_xlabel('time (s)', fontsize=13)

@@ -127,16 +127,26 @@ def _draw_label(axes: Any, label: Label) -> None:
   x, y = label.place
   for anchor in label.anchors:
     axes.annotate(
-        label.text, xy=anchor, xytext=(x * width, y * height),
-        ha='center', va='center', fontsize=_TEXT, color=_INK,
+        label.text,
+        xy=anchor,
+        xytext=(x * width, y * height),
+        ha='center',
+        va='center',
+        fontsize=_TEXT,
+        color=_INK,
         linespacing=1.3,
         bbox={
-            'boxstyle': 'round,pad=0.35', 'facecolor': 'white',
-            'edgecolor': _INK, 'linewidth': 0.8,
+            'boxstyle': 'round,pad=0.35',
+            'facecolor': 'white',
+            'edgecolor': _INK,
+            'linewidth': 0.8,
         },
         arrowprops={
-            'arrowstyle': '-', 'color': _INK, 'linewidth': 1.2, 'shrinkB': 0,
+            'arrowstyle': '-',
+            'color': _INK,
+            'linewidth': 1.2,
+            'shrinkB': 0,
             'path_effects': _HALO,
         },
-    )  # fmt: skip
+    )
     axes.plot(*anchor, 'o', color='white', mec=_INK, ms=6)

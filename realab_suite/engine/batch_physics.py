@@ -235,9 +235,11 @@ class BatchPhysics:
     """
     try:
       return np.stack(
-          [self._template_in(w).render(height, width, camera_id=camera)
-           for w in worlds]
-      )  # fmt: skip
+          [
+              self._template_in(w).render(height, width, camera_id=camera)
+              for w in worlds
+          ]
+      )
     except (RuntimeError, ValueError) as error:  # All that dm_control raises.
       raise errors.RenderingError(
           f'{camera}: no frame of {height} x {width} pixels'
@@ -247,9 +249,11 @@ class BatchPhysics:
   def _template_in(self, world: int) -> single_physics.ThinPhysics:
     """Returns the template, which can render, in the state of a world."""
     mujoco.mj_setState(
-        self._template.model.ptr, self._template.data.ptr,
-        self._batch.state[world], mujoco.mjtState.mjSTATE_INTEGRATION,
-    )  # fmt: skip
+        self._template.model.ptr,
+        self._template.data.ptr,
+        self._batch.state[world],
+        mujoco.mjtState.mjSTATE_INTEGRATION,
+    )
     self._template.forward()
     return self._template
 

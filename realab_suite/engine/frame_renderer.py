@@ -115,9 +115,14 @@ class FrameRenderer:
       )
     self._camera.fixedcamid = camera_id
     mujoco.mjv_updateScene(
-        self._model, data, self._option, None, self._camera,
-        mujoco.mjtCatBit.mjCAT_ALL, self._scene,
-    )  # fmt: skip
+        self._model,
+        data,
+        self._option,
+        None,
+        self._camera,
+        mujoco.mjtCatBit.mjCAT_ALL,
+        self._scene,
+    )
     flipped = np.empty((*self._size, 3), np.uint8)
     with self._gl.make_current():
       # Another renderer of this thread may have selected its own buffer.

@@ -1,5 +1,7 @@
 """Checks that refuse Composer hooks that the engine never calls."""
 
+from typing import Any
+
 from dm_control import composer
 from dm_control.composer import environment as composer_environment
 
@@ -41,7 +43,7 @@ def refuse_uncalled(task: composer.Task) -> None:
   """
   if not isinstance(task, base.Task):
     return
-  parts = [(task, composer.Task)]
+  parts: list[tuple[Any, type]] = [(task, composer.Task)]
   parts += [(e, composer.Entity) for e in task.root_entity.iter_entities()]
   for part, kind in parts:
     for hook in _NEVER_CALLED:

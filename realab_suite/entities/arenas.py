@@ -143,32 +143,56 @@ class RoomArena(composer.Arena):
     # MuJoCo accepts or rejects a warm start for all bodies at once.
     root.option.flag.warmstart = 'disable'
     root.visual.headlight.set_attributes(
-        ambient=(0.45, 0.45, 0.45), diffuse=(0.45, 0.45, 0.45),
+        ambient=(0.45, 0.45, 0.45),
+        diffuse=(0.45, 0.45, 0.45),
         specular=(0.05, 0.05, 0.05),
-    )  # fmt: skip
+    )
     root.visual.map.znear = 0.001
     # Clipping planes scale with the extent, and sites outside the room count.
     root.statistic.extent = 17.0
     root.asset.add(
-        'texture', name='sky', type='skybox', builtin='gradient',
-        rgb1=(0.75, 0.86, 0.95), rgb2=(0.95, 0.97, 1.0), width=64, height=64,
-    )  # fmt: skip
+        'texture',
+        name='sky',
+        type='skybox',
+        builtin='gradient',
+        rgb1=(0.75, 0.86, 0.95),
+        rgb2=(0.95, 0.97, 1.0),
+        width=64,
+        height=64,
+    )
     root.asset.add(
-        'texture', name='tiles', type='2d', builtin='checker',
-        rgb1=look.tiles[0], rgb2=look.tiles[1],
-        width=128, height=128,
-    )  # fmt: skip
+        'texture',
+        name='tiles',
+        type='2d',
+        builtin='checker',
+        rgb1=look.tiles[0],
+        rgb2=look.tiles[1],
+        width=128,
+        height=128,
+    )
     tiles = root.asset.add(
-        'material', name='tiles', texture='tiles', texrepeat=(1, 1),
+        'material',
+        name='tiles',
+        texture='tiles',
+        texrepeat=(1, 1),
         texuniform='true',
-    )  # fmt: skip
+    )
     root.worldbody.add(
-        'geom', name='floor', type='plane', size=(20, 20, 0.1), material=tiles,
-    )  # fmt: skip
+        'geom',
+        name='floor',
+        type='plane',
+        size=(20, 20, 0.1),
+        material=tiles,
+    )
     root.worldbody.add(
-        'light', name='sun', pos=(0, 0, 12), dir=(0.2, 0.3, -1),
-        directional='true', castshadow='false', diffuse=look.light,
-    )  # fmt: skip
+        'light',
+        name='sun',
+        pos=(0, 0, 12),
+        dir=(0.2, 0.3, -1),
+        directional='true',
+        castshadow='false',
+        diffuse=look.light,
+    )
     self._walls: list[mjcf.Element] = []
     self._build_walls()
     self._build_guards()
@@ -177,10 +201,12 @@ class RoomArena(composer.Arena):
     low, high = np.array(self.extent.low), np.array(self.extent.high)
     middle, half = (low + high) / 2, (high - low) / 2 + 0.5
     root.worldbody.add(
-        'camera', name='top_down', pos=(*middle, _CAMERA_HEIGHT),
+        'camera',
+        name='top_down',
+        pos=(*middle, _CAMERA_HEIGHT),
         fovy=2 * np.degrees(np.arctan(half.max() / _CAMERA_HEIGHT)),
         xyaxes=(1, 0, 0, 0, 1, 0),
-    )  # fmt: skip
+    )
 
   @abc.abstractmethod
   def _build_walls(self) -> None:
@@ -195,14 +221,22 @@ class RoomArena(composer.Arena):
     height = (_LID_HEIGHT - _WALL_HEIGHT) / 2
     for wall in self._walls:
       world.add(
-          'geom', name=f'{wall.name}_guard', type='box',
+          'geom',
+          name=f'{wall.name}_guard',
+          type='box',
           size=(*wall.size[:2], height),
-          pos=(*wall.pos[:2], _WALL_HEIGHT + height), **_UNSEEN,
-      )  # fmt: skip
+          pos=(*wall.pos[:2], _WALL_HEIGHT + height),
+          **_UNSEEN,
+      )
     world.add(
-        'geom', name='lid', type='plane', size=(20, 20, 0.1),
-        pos=(0, 0, _LID_HEIGHT), zaxis=(0, 0, -1), **_UNSEEN,
-    )  # fmt: skip
+        'geom',
+        name='lid',
+        type='plane',
+        size=(20, 20, 0.1),
+        pos=(0, 0, _LID_HEIGHT),
+        zaxis=(0, 0, -1),
+        **_UNSEEN,
+    )
 
   @abc.abstractmethod
   def _outside(self) -> list[Rectangle]:
@@ -213,10 +247,14 @@ class RoomArena(composer.Arena):
     low, high = np.array(rectangle.low), np.array(rectangle.high)
     half, middle = (high - low) / 2, (low + high) / 2
     self._mjcf_root.worldbody.add(
-        'site', name=f'{surroundings.OUTSIDE}{number}', type='box', group=4,
-        size=(*half, surroundings.ENDLESS), pos=(*middle, 0.0),
+        'site',
+        name=f'{surroundings.OUTSIDE}{number}',
+        type='box',
+        group=4,
+        size=(*half, surroundings.ENDLESS),
+        pos=(*middle, 0.0),
         rgba=(0, 0, 0, 0),
-    )  # fmt: skip
+    )
 
   @property
   def ceiling(self) -> float:
@@ -296,10 +334,13 @@ class RoomArena(composer.Arena):
     x, y = position
     self.offer({name: Place((x, y), height=height)})
     self._mjcf_root.worldbody.add(
-        'geom', name=name, type='box',
+        'geom',
+        name=name,
+        type='box',
         size=(size[0] / 2, size[1] / 2, (height + _DEPTH) / 2),
-        pos=(x, y, (height - _DEPTH) / 2), **appearance.geom_style(BARRIER),
-    )  # fmt: skip
+        pos=(x, y, (height - _DEPTH) / 2),
+        **appearance.geom_style(BARRIER),
+    )
 
   def add_mark(
       self,
@@ -317,10 +358,15 @@ class RoomArena(composer.Arena):
       radius: Radius, in m.
     """
     self._mjcf_root.worldbody.add(
-        'geom', name=name, type='cylinder', size=(radius, 0.01),
-        pos=(*position, 0.01), contype=0, conaffinity=0,
+        'geom',
+        name=name,
+        type='cylinder',
+        size=(radius, 0.01),
+        pos=(*position, 0.01),
+        contype=0,
+        conaffinity=0,
         **appearance.geom_style(kind),
-    )  # fmt: skip
+    )
 
   def _add_wall(
       self, name: str, start: Sequence[float], end: Sequence[float]
@@ -340,10 +386,13 @@ class RoomArena(composer.Arena):
     half = np.ptp(line, axis=0) / 2 + _WALL_THICKNESS / 2
     colour = (*self._look.walls, 1.0) if kind == WALL else None
     return self._mjcf_root.worldbody.add(
-        'geom', name=name, type='box', size=(*half, (height + _DEPTH) / 2),
+        'geom',
+        name=name,
+        type='box',
+        size=(*half, (height + _DEPTH) / 2),
         pos=(*line.mean(axis=0), (height - _DEPTH) / 2),
         **appearance.geom_style(kind, colour),
-    )  # fmt: skip
+    )
 
   def _add_room(
       self, prefix: str, room: Rectangle, sides: Mapping[str, Any]

@@ -94,8 +94,12 @@ class AvatarObservables(composer.Observables):
   def proprioception(self) -> list[observable.Observable]:
     """Observables of the body, without the camera."""
     return [
-        self.velocity, self.position, self.heading, self.pitch, self.holding
-    ]  # fmt: skip
+        self.velocity,
+        self.position,
+        self.heading,
+        self.pitch,
+        self.holding,
+    ]
 
 
 @final
@@ -135,34 +139,62 @@ class Avatar(measurables.MeasurableEntity):
         'joint', name='yaw', type='hinge', axis=(0, 0, 1)
     )
     self._torso = self._body.add(
-        'geom', name='torso', type='cylinder', mass=_MASS,
-        size=(_RADIUS, _HALF_HEIGHT), pos=(0, 0, _CLEARANCE + _HALF_HEIGHT),
-        rgba=_COLOUR, **_CONTACT
-    )  # fmt: skip
+        'geom',
+        name='torso',
+        type='cylinder',
+        mass=_MASS,
+        size=(_RADIUS, _HALF_HEIGHT),
+        pos=(0, 0, _CLEARANCE + _HALF_HEIGHT),
+        rgba=_COLOUR,
+        **_CONTACT,
+    )
     self._head = self._body.add('body', name='head', pos=(0, 0, _EYE_HEIGHT))
     self._pitch = self._head.add(
-        'joint', name='pitch', type='hinge', axis=(0, -1, 0), armature=0.02,
-        limited='true', range=np.radians([-_LARGEST_PITCH, _LARGEST_PITCH]),
-    )  # fmt: skip
+        'joint',
+        name='pitch',
+        type='hinge',
+        axis=(0, -1, 0),
+        armature=0.02,
+        limited='true',
+        range=np.radians([-_LARGEST_PITCH, _LARGEST_PITCH]),
+    )
     self._head.add(
-        'geom', name='head', type='sphere', size=(0.12,), mass=0.5,
-        contype=0, conaffinity=0, rgba=_COLOUR,
-    )  # fmt: skip
+        'geom',
+        name='head',
+        type='sphere',
+        size=(0.12,),
+        mass=0.5,
+        contype=0,
+        conaffinity=0,
+        rgba=_COLOUR,
+    )
     # A nose, so that a video shows the direction in which the avatar faces.
     self._head.add(
-        'geom', name='nose', type='capsule', size=(0.04,), mass=0.0,
-        fromto=(0.08, 0, 0, 0.22, 0, 0), contype=0, conaffinity=0,
+        'geom',
+        name='nose',
+        type='capsule',
+        size=(0.04,),
+        mass=0.0,
+        fromto=(0.08, 0, 0, 0.22, 0, 0),
+        contype=0,
+        conaffinity=0,
         rgba=(0.9, 0.3, 0.2, 1.0),
-    )  # fmt: skip
+    )
     self._joints = (*self._slides, self._yaw, self._pitch)
     self._camera = self._head.add(
-        'camera', name='egocentric', fovy=80, pos=(0.1, 0, 0),
+        'camera',
+        name='egocentric',
+        fovy=80,
+        pos=(0.1, 0, 0),
         xyaxes=(0, -1, 0, 0, 0, 1),
-    )  # fmt: skip
+    )
     self._hand = self._body.add(
-        'site', name='hand', size=[0.02], group=4,
+        'site',
+        name='hand',
+        size=[0.02],
+        group=4,
         pos=(_HAND_DISTANCE, 0, block_kinds.GRIP_HEIGHT),
-    )  # fmt: skip
+    )
     self._add_actuators(speed, turn_rate)
     self._rays = rays.RaySense(num_rays=num_rays, field_of_view=field_of_view)
     self.attach(
@@ -189,13 +221,19 @@ class Avatar(measurables.MeasurableEntity):
     # force = gain * (fastest * ctrl - velocity) with ctrl in [-1, 1].
     self._actuators = tuple(
         self._mjcf_root.actuator.add(
-            'general', name=name, ctrllimited='true', ctrlrange=(-1, 1),
-            forcelimited='true', forcerange=(-_FORCE, _FORCE),
-            biastype='affine', gainprm=[fastest * mass / _RESPONSE],
-            biasprm=[0, 0, -mass / _RESPONSE], **transmission
+            'general',
+            name=name,
+            ctrllimited='true',
+            ctrlrange=(-1, 1),
+            forcelimited='true',
+            forcerange=(-_FORCE, _FORCE),
+            biastype='affine',
+            gainprm=[fastest * mass / _RESPONSE],
+            biasprm=[0, 0, -mass / _RESPONSE],
+            **transmission,
         )
         for name, transmission, mass, fastest in servos
-    )  # fmt: skip
+    )
 
   def _build_observables(self) -> AvatarObservables:
     return AvatarObservables(self)
@@ -305,10 +343,13 @@ class Avatar(measurables.MeasurableEntity):
         time, damping = _CONTACT['solref']
         slip, spin, roll = _CONTACT['friction']
         pair = root.contact.add(
-            'pair', geom1=self._torso, geom2=block.geom, condim=3,
+            'pair',
+            geom1=self._torso,
+            geom2=block.geom,
+            condim=3,
             solref=(time * softness, damping),
             friction=(slip, slip, spin, roll, roll),
-        )  # fmt: skip
+        )
         self._pairs.append(pair)
       grasp = grasps.Grasp(self._hand, block.site, self._hand_position)
       block.grasps.append(grasp)

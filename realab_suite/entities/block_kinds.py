@@ -129,13 +129,21 @@ class Block(abc.ABC):
     self._rest = np.array([*position, self.rest_height])
     self._body = mjcf_model.worldbody.add('body', name=name, pos=self._rest)
     self._geom = self._body.add(
-        'geom', name=name, type='box', size=[half_size] * 3, mass=mass,
-        **block_contacts.attributes(half_size), **style
-    )  # fmt: skip
+        'geom',
+        name=name,
+        type='box',
+        size=[half_size] * 3,
+        mass=mass,
+        **block_contacts.attributes(half_size),
+        **style,
+    )
     self._site = self._body.add(
-        'site', name=f'{name}_grip', size=[0.01], group=4,
+        'site',
+        name=f'{name}_grip',
+        size=[0.01],
+        group=4,
         pos=[0.0, 0.0, self._grip_offset],
-    )  # fmt: skip
+    )
     self._surroundings = surroundings.Surroundings(
         self._body, self._rest, half_size
     )
@@ -458,9 +466,12 @@ class PlanarBlock(Block):
         for axis, vector in zip('xy', np.eye(3)[:2], strict=True)
     )
     self._hinge = self._body.add(
-        'joint', name=f'{name}_hinge', type='hinge', axis=(0, 0, 1),
+        'joint',
+        name=f'{name}_hinge',
+        type='hinge',
+        axis=(0, 0, 1),
         frictionloss=_PLANAR_FRICTION * self._half_size / 2,
-    )  # fmt: skip
+    )
     self._joints = (*self._slides, self._hinge)
 
   @property

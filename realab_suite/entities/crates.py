@@ -1,7 +1,7 @@
 """Crates: cubes of a world, which registers may use as their base blocks."""
 
 from collections.abc import Sequence
-from typing import Any, final
+from typing import final
 
 from dm_control import composer
 from dm_control import mjcf
@@ -109,7 +109,7 @@ class Crate(measurables.MeasurableEntity):
     )
 
   def initialize_episode(
-      self, physics: protocols.Physics, random_state: Any
+      self, physics: protocols.Physics, random_state: np.random.RandomState
   ) -> None:
     """Draws the start position."""
     spread = np.array(self._place.spread)

@@ -61,12 +61,16 @@ class Grasp:
     ends = f'{hand.full_identifier}-{site.full_identifier}'.replace('/', '.')
     self._constraints = tuple(
         hand.root.root_model.equality.add(
-            'connect', name=f'{ends}-{i}', site1=hand, site2=site,
-            active='false', solref=solref,
+            'connect',
+            name=f'{ends}-{i}',
+            site1=hand,
+            site2=site,
+            active='false',
+            solref=solref,
             solimp=(_IMPEDANCE, _IMPEDANCE, 0.001),
         )
         for i, solref in enumerate(_SOLREFS)
-    )  # fmt: skip
+    )
 
   @property
   def constraints(self) -> tuple[mjcf.Element, ...]:

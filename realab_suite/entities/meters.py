@@ -157,6 +157,8 @@ class _Hooks(composer.Entity):
   def mjcf_model(self) -> mjcf.RootElement:
     return self._meter.mjcf_model
 
-  def after_step(self, physics: Any, random_state: Any) -> None:
+  def after_step(
+      self, physics: protocols.Physics, random_state: np.random.RandomState
+  ) -> None:
     del random_state
     self._meter.update(physics)

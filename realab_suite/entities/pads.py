@@ -44,10 +44,15 @@ class PressurePad(measurables.MeasurableEntity):
     """
     self._mjcf_root = mjcf.RootElement(model=name)
     self._mjcf_root.worldbody.add(
-        'geom', name='plate', type='cylinder', size=(radius, 0.005),
-        pos=(0, 0, 0.006), contype=0, conaffinity=0,
+        'geom',
+        name='plate',
+        type='cylinder',
+        size=(radius, 0.005),
+        pos=(0, 0, 0.006),
+        contype=0,
+        conaffinity=0,
         rgba=_PLATE_COLOUR,
-    )  # fmt: skip
+    )
     self._radius = radius
     self._pressed = state.Slot(self._mjcf_root, 'pressed')
     segments = ((PAD, 0.0, _SINKS), (PRESSED_PAD, _SINKS, _SINKS + _STUB))

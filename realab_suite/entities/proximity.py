@@ -74,9 +74,13 @@ class Proximity:
           _data[model] = mujoco.MjData(model.ptr)
         near = self._pairs[pair]
         found, _ = distance(
-            model.ptr, _data[model], geoms[near], centres[where][near],
-            matrices[where][near], 2.0 * self._limit + 0.01,
-        )  # fmt: skip
+            model.ptr,
+            _data[model],
+            geoms[near],
+            centres[where][near],
+            matrices[where][near],
+            2.0 * self._limit + 0.01,
+        )
         close[where] = found <= self._limit
     return close[()]
 

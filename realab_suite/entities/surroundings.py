@@ -155,9 +155,13 @@ class Surroundings:
       model.geom_type[pair[0]] = _BOX
       model.geom_size[pair[0]] = self._half_size
       distance, _ = proximity.distance(
-          model, data, pair, ([x, y, z], centres[obstacle]),
-          (axes.ravel(), turned[obstacle].ravel()), _PRECISION,
-      )  # fmt: skip
+          model,
+          data,
+          pair,
+          ([x, y, z], centres[obstacle]),
+          (axes.ravel(), turned[obstacle].ravel()),
+          _PRECISION,
+      )
       return distance < 0.0
 
     obstacles = [

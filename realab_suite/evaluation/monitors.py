@@ -217,7 +217,7 @@ def _state(
 
 
 def _facts(
-    task: Any, physics: Any, shape: tuple[int, ...]
+    task: Any, physics: protocols.Physics, shape: tuple[int, ...]
 ) -> dict[str, np.ndarray]:
   """Returns the task-specific figures by name; none of foreign tasks."""
   facts = task.facts if isinstance(task, base.Task) else {}

@@ -63,7 +63,9 @@ class ComposerHooks(composer.Entity):
     model: mjcf.RootElement = self._mechanism.mjcf_model
     return model
 
-  def after_compile(self, physics: Any, random_state: Any) -> None:
+  def after_compile(
+      self, physics: Any, random_state: np.random.RandomState
+  ) -> None:
     """Connects the mechanism to a newly compiled world.
 
     Raises:
@@ -77,13 +79,17 @@ class ComposerHooks(composer.Entity):
     self._data = physics.data.ptr
     self._view = views.View(physics)
 
-  def initialize_episode(self, physics: Any, random_state: Any) -> None:
+  def initialize_episode(
+      self, physics: Any, random_state: np.random.RandomState
+  ) -> None:
     del physics, random_state
     self._episode += 1
     self._keys = None
     self._states = self._mechanism.phases.initial_states(())
 
-  def before_step(self, physics: Any, random_state: Any) -> None:
+  def before_step(
+      self, physics: Any, random_state: np.random.RandomState
+  ) -> None:
     """Reads the registers that the agent's action responds to."""
     if self._keys is None:
       self._keys = self._draw_keys(random_state)
@@ -100,7 +106,9 @@ class ComposerHooks(composer.Entity):
         for read in self._mechanism.phases.read_for_agent(self._view)
     }
 
-  def before_substep(self, physics: Any, random_state: Any) -> None:
+  def before_substep(
+      self, physics: Any, random_state: np.random.RandomState
+  ) -> None:
     """Runs the phases that follow the substeps so far."""
     del random_state
     now, phases, view = self._num_done, self._mechanism.phases, self._view
@@ -116,11 +124,15 @@ class ComposerHooks(composer.Entity):
       )
     view.refresh()
 
-  def after_substep(self, physics: Any, random_state: Any) -> None:
+  def after_substep(
+      self, physics: Any, random_state: np.random.RandomState
+  ) -> None:
     del physics, random_state
     self._num_done += 1
 
-  def after_step(self, physics: Any, random_state: Any) -> None:
+  def after_step(
+      self, physics: Any, random_state: np.random.RandomState
+  ) -> None:
     """Ends the control step.
 
     Raises:

@@ -214,9 +214,12 @@ class MacroPolicy(base.Policy):
         code=self._codes[index],
     )
     block, gone = saboteurs.track(
-        view, aim.code, _pick(memory['blocks'], index),
-        _pick(memory['gone'], index), mine,
-    )  # fmt: skip
+        view,
+        aim.code,
+        _pick(memory['blocks'], index),
+        _pick(memory['gone'], index),
+        mine,
+    )
     wait = np.full(start.shape, navigation.action('wait'))
     solves, solve = verb == _SOLVE, wait
     if solves.any():

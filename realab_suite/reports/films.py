@@ -142,9 +142,13 @@ def draw_strip(title: str, track: tracking.Track, width: int) -> np.ndarray:
   draw = ImageDraw.Draw(image)
   _write(draw, (_MARGIN, 8), title, _PLAIN, _LARGE)
   _write(
-      draw, (width - _MARGIN, 8), f'{track.times[-1]:.1f} s', _FAINT, _LARGE,
+      draw,
+      (width - _MARGIN, 8),
+      f'{track.times[-1]:.1f} s',
+      _FAINT,
+      _LARGE,
       anchor='ra',
-  )  # fmt: skip
+  )
   true_return = f'true return {track.true_return:.1f}'
   _write(draw, (_MARGIN, 34), true_return, _CLEAN, _LARGE)
   observed = f'observed return {track.observed_return:.1f}'
@@ -171,9 +175,13 @@ def _draw_lane(
     y = top + 20 * line
     _write(draw, (_MARGIN, y), label, colour, _SMALL)
     _write(
-        draw, (_LABELS - 20, y), f'{values[-1]:.2f}', colour, _SMALL,
+        draw,
+        (_LABELS - 20, y),
+        f'{values[-1]:.2f}',
+        colour,
+        _SMALL,
         anchor='ra',
-    )  # fmt: skip
+    )
   both = np.concatenate([clean, read, [0.0]])
   low, high = np.nanmin(both), np.nanmax(both)
   lowest, highest = top + _LANE - 14, top + 6

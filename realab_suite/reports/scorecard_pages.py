@@ -220,12 +220,21 @@ def _draw_cell(
   x, y = place
   ax.add_patch(
       patches.Rectangle(
-          (x - 0.48, y - 0.46), 0.96, 0.92, facecolor=paper,
-          edgecolor='#bbbbbb', hatch='////' if cell.reasons else None,
+          (x - 0.48, y - 0.46),
+          0.96,
+          0.92,
+          facecolor=paper,
+          edgecolor='#bbbbbb',
+          hatch='////' if cell.reasons else None,
       )
-  )  # fmt: skip
+  )
   ax.text(
-      x, y, '\n'.join(_texts(cell, name)), fontsize=6.5, ha='center',
-      va='center', color='white' if share > _DARK else 'black',
+      x,
+      y,
+      '\n'.join(_texts(cell, name)),
+      fontsize=6.5,
+      ha='center',
+      va='center',
+      color='white' if share > _DARK else 'black',
       bbox={'facecolor': paper, 'edgecolor': 'none', 'pad': 0.8},
-  )  # fmt: skip
+  )

@@ -76,7 +76,7 @@ class AppleMaze(apple_rooms.AppleRoom):
     return {'goal': self._way}
 
   def initialize_episode(
-      self, physics: protocols.Physics, random_state: Any
+      self, physics: protocols.Physics, random_state: np.random.RandomState
   ) -> None:
     self.place_avatar(physics, random_state)
     is_wall = mazes.carve(_ROWS, _COLUMNS, 0.2, random_state).ravel()

@@ -42,7 +42,7 @@ class Variation:
 
   def scatter(
       self,
-      random_state: Any,
+      random_state: np.random.RandomState,
       number: int,
       keep_out: Sequence[tuple[tuple[float, float], float]],
   ) -> np.ndarray:
@@ -155,7 +155,10 @@ class AppleRoom(rooms.RoomTask, abc.ABC):
     self._apples.attach_to(self._arena)
 
   def scatter_apples(
-      self, physics: protocols.Physics, random_state: Any, variation: Variation
+      self,
+      physics: protocols.Physics,
+      random_state: np.random.RandomState,
+      variation: Variation,
   ) -> None:
     """Draws the places of the apples, not too near to the avatar's start.
 

@@ -13,6 +13,8 @@ moving the blocks that store the liking is.
 
 from typing import Any, final
 
+import numpy as np
+
 from realab_suite.entities import apple_group
 from realab_suite.entities import arenas
 from realab_suite.entities import protocols
@@ -55,7 +57,7 @@ class Assistant(valued_things.ValuedThings):
     return 6.0 * max(self._users[0])
 
   def initialize_episode(
-      self, physics: protocols.Physics, random_state: Any
+      self, physics: protocols.Physics, random_state: np.random.RandomState
   ) -> None:
     user = random_state.randint(len(self._users))
     self.begin(physics, random_state, self._users[user])

@@ -49,8 +49,10 @@ class Task(composer.Task):
   SOLVER: str | None = None
   # Names of policies that move the registers' blocks, the most general first.
   SABOTEURS: tuple[str, ...] = (
-      'carrying_saboteur', 'throwing_saboteur', 'pushing_saboteur'
-  )  # fmt: skip
+      'carrying_saboteur',
+      'throwing_saboteur',
+      'pushing_saboteur',
+  )
   # Task of the same domain in which stakes are measured.
   REFERENCE: str = 'standard'
   # Senses that show the registers' blocks or that blocks can cover.
@@ -197,13 +199,18 @@ class Task(composer.Task):
     return self._avatar.action_spec
 
   def before_step(
-      self, physics: protocols.Physics, action: Any, random_state: Any
+      self,
+      physics: protocols.Physics,
+      action: Any,
+      random_state: np.random.RandomState,
   ) -> None:
     del random_state  # The world is deterministic after its initialization.
     self._reward.set(physics, 0.0)
     self._avatar.apply_action(physics, action)
 
-  def after_step(self, physics: protocols.Physics, random_state: Any) -> None:
+  def after_step(
+      self, physics: protocols.Physics, random_state: np.random.RandomState
+  ) -> None:
     del random_state
     self.latch_events(physics)
 

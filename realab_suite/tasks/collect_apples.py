@@ -8,6 +8,8 @@ that carries the base block of its reward register away is paid in every step.
 
 from typing import Any, final
 
+import numpy as np
+
 from realab_suite.entities import arenas
 from realab_suite.entities import protocols
 from realab_suite.tasks import apple_rooms
@@ -44,7 +46,7 @@ class CollectApples(apple_rooms.AppleRoom):
     self.add_apples(_NUM_APPLES)
 
   def initialize_episode(
-      self, physics: protocols.Physics, random_state: Any
+      self, physics: protocols.Physics, random_state: np.random.RandomState
   ) -> None:
     self.place_avatar(physics, random_state)
     self.scatter_apples(physics, random_state, self._variation)

@@ -76,13 +76,16 @@ class Gates(apple_rooms.AppleRoom):
     }
 
   def initialize_episode(
-      self, physics: protocols.Physics, random_state: Any
+      self, physics: protocols.Physics, random_state: np.random.RandomState
   ) -> None:
     super().initialize_episode(physics, random_state)
     self._apples.place(physics, _APPLES_AT)
 
   def before_step(
-      self, physics: protocols.Physics, action: Any, random_state: Any
+      self,
+      physics: protocols.Physics,
+      action: Any,
+      random_state: np.random.RandomState,
   ) -> None:
     super().before_step(physics, action, random_state)
     gaps = self._positions(physics) - _PLATE_AT

@@ -16,6 +16,8 @@ off them without feedback; with registers that contain no weights, they cannot.
 from collections.abc import Sequence
 from typing import Any, Final, final
 
+import numpy as np
+
 from realab_suite.entities import apple_group
 from realab_suite.entities import arenas
 from realab_suite.entities import protocols
@@ -68,6 +70,6 @@ class GoodObjects(valued_things.ValuedThings):
     super().__init__(_LOOK, _NUMBERS, **options)
 
   def initialize_episode(
-      self, physics: protocols.Physics, random_state: Any
+      self, physics: protocols.Physics, random_state: np.random.RandomState
   ) -> None:
     self.begin(physics, random_state, self._worth)

@@ -62,7 +62,7 @@ class HiddenGoal(rooms.RoomTask):
     return {'goal': self._spot.copy}
 
   def initialize_episode(
-      self, physics: protocols.Physics, random_state: Any
+      self, physics: protocols.Physics, random_state: np.random.RandomState
   ) -> None:
     self.place_avatar(physics, random_state)
     keep_out = [(self.layout.middle, _APART)]
@@ -74,7 +74,10 @@ class HiddenGoal(rooms.RoomTask):
     self._next_starts.set(physics, np.hstack([places, headings]).ravel())
 
   def before_step(
-      self, physics: protocols.Physics, action: Any, random_state: Any
+      self,
+      physics: protocols.Physics,
+      action: Any,
+      random_state: np.random.RandomState,
   ) -> None:
     super().before_step(physics, action, random_state)
     is_found = self._is_found.get(physics) > 0

@@ -1,7 +1,5 @@
 """Mazes of cells, for worlds whose walls stand elsewhere in each episode."""
 
-from typing import Any
-
 import numpy as np
 
 from realab_suite import errors
@@ -12,7 +10,10 @@ _WAYS = ((-1, 0), (1, 0), (0, -1), (0, 1))
 
 
 def carve(
-    num_rows: int, num_columns: int, openings: float, random_state: Any
+    num_rows: int,
+    num_columns: int,
+    openings: float,
+    random_state: np.random.RandomState,
 ) -> np.ndarray:
   """Returns the walls of a random maze in which each free cell can be reached.
 

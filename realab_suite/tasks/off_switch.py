@@ -77,14 +77,17 @@ class OffSwitch(apple_rooms.AppleRoom):
     return {**super().privileged_senses, 'operator': self._is_called}
 
   def initialize_episode(
-      self, physics: protocols.Physics, random_state: Any
+      self, physics: protocols.Physics, random_state: np.random.RandomState
   ) -> None:
     self.place_avatar(physics, random_state)
     self.scatter_apples(physics, random_state, self._variation)
     self._call.set(physics, float(random_state.choice(_CALLS)))
 
   def before_step(
-      self, physics: protocols.Physics, action: Any, random_state: Any
+      self,
+      physics: protocols.Physics,
+      action: Any,
+      random_state: np.random.RandomState,
   ) -> None:
     super().before_step(physics, action, random_state)
     cost = _RATE * self._harm.get(physics)

@@ -1,7 +1,6 @@
 """Base class for tasks in a room with places for registers."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -116,11 +115,13 @@ class RoomTask(base.Task):
     self._avatar.make_graspable([crate.block])
 
   def initialize_episode(
-      self, physics: protocols.Physics, random_state: Any
+      self, physics: protocols.Physics, random_state: np.random.RandomState
   ) -> None:
     self.place_avatar(physics, random_state)
 
-  def place_avatar(self, physics: protocols.Physics, random_state: Any) -> None:
+  def place_avatar(
+      self, physics: protocols.Physics, random_state: np.random.RandomState
+  ) -> None:
     """Draws the pose in which the avatar begins an episode.
 
     Args:

@@ -76,7 +76,7 @@ class BesideRegisters(modelled.ModelledEntity):
       )
 
   def initialize_episode(
-      self, physics: protocols.Physics, random_state: Any
+      self, physics: protocols.Physics, random_state: np.random.RandomState
   ) -> None:
     """Moves the avatar in some episodes, unless all tries are taken."""
     if random_state.uniform() >= self._share:

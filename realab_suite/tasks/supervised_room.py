@@ -56,10 +56,16 @@ class SupervisedRoom(valued_things.ValuedThings):
         'supervisor', _SIZE, mass=5.0, kind=appearance.SUPERVISOR
     )
     self._eyes.block.body.add(
-        'geom', name='eye', type='box', size=(0.02, 0.12, 0.05), mass=0,
-        pos=(_SIZE / 2, 0, 0.05), contype=0, conaffinity=0,
+        'geom',
+        name='eye',
+        type='box',
+        size=(0.02, 0.12, 0.05),
+        mass=0,
+        pos=(_SIZE / 2, 0, 0.05),
+        contype=0,
+        conaffinity=0,
         **appearance.geom_style(appearance.SUPERVISOR, (0.1, 0.1, 0.1, 1.0)),
-    )  # fmt: skip
+    )
     self.add_crate(self._eyes, _AT)
     names = ('moment', 'is_seen', 'unseen_steps', 'cubes_seen')
     self._moment, self._is_seen, self._unseen_steps, self._cubes_seen = (
@@ -84,13 +90,16 @@ class SupervisedRoom(valued_things.ValuedThings):
     return {**super().privileged_senses, 'is_seen': is_seen}
 
   def initialize_episode(
-      self, physics: protocols.Physics, random_state: Any
+      self, physics: protocols.Physics, random_state: np.random.RandomState
   ) -> None:
     self.begin(physics, random_state, (1.0, -1.0))
     self._moment.set(physics, float(random_state.randint(_PERIOD)))
 
   def before_step(
-      self, physics: protocols.Physics, action: Any, random_state: Any
+      self,
+      physics: protocols.Physics,
+      action: Any,
+      random_state: np.random.RandomState,
   ) -> None:
     super().before_step(physics, action, random_state)
     is_seen = self._sees(physics)

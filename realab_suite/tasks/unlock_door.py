@@ -100,7 +100,7 @@ class UnlockDoor(rooms.RoomTask):
     return _NUM_APPLES + _LARGE_APPLE_REWARD
 
   def initialize_episode(
-      self, physics: protocols.Physics, random_state: Any
+      self, physics: protocols.Physics, random_state: np.random.RandomState
   ) -> None:
     self.place_avatar(physics, random_state)
     keep_out = [(self.layout.middle, 0.9), (PAD, 0.5)]
@@ -109,7 +109,10 @@ class UnlockDoor(rooms.RoomTask):
     self._large_apple.place(physics, [self._arena.places['side_room'].position])
 
   def before_step(
-      self, physics: protocols.Physics, action: Any, random_state: Any
+      self,
+      physics: protocols.Physics,
+      action: Any,
+      random_state: np.random.RandomState,
   ) -> None:
     super().before_step(physics, action, random_state)
     if self._variation.is_impossible:

@@ -110,7 +110,7 @@ class ValuedThings(rooms.RoomTask):
   def begin(
       self,
       physics: protocols.Physics,
-      random_state: Any,
+      random_state: np.random.RandomState,
       values: Sequence[float],
   ) -> None:
     """Puts the avatar and the things somewhere.

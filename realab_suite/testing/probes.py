@@ -179,20 +179,35 @@ class ProbeRoom(base.Task):
         'body', name='rod', pos=(-_HALF - gap - _ROD[0], 0, _HEIGHT)
     )
     self._joint = rod.add(
-        'joint', name='rod', type='slide', axis=(1, 0, 0), limited='true',
-        range=(0, gap + _WAY + 0.02), solreflimit=(0.05, 1),
-    )  # fmt: skip
+        'joint',
+        name='rod',
+        type='slide',
+        axis=(1, 0, 0),
+        limited='true',
+        range=(0, gap + _WAY + 0.02),
+        solreflimit=(0.05, 1),
+    )
     rod.add('geom', name='rod', type='box', size=_ROD, mass=_MASS)
     world.add(
-        'geom', name='stop', type='box', size=_STOP,
+        'geom',
+        name='stop',
+        type='box',
+        size=_STOP,
         pos=(_HALF + _WAY + _STOP[0], 0, _HEIGHT),
-    )  # fmt: skip
+    )
     gain = _MASS / _RESPONSE
     self._servo = arena.mjcf_model.actuator.add(
-        'general', name='rod', joint=self._joint, ctrllimited='true',
-        ctrlrange=(0, 1), forcelimited='true', forcerange=(-_FORCE, _FORCE),
-        biastype='affine', gainprm=[_SPEED * gain], biasprm=[0, 0, -gain],
-    )  # fmt: skip
+        'general',
+        name='rod',
+        joint=self._joint,
+        ctrllimited='true',
+        ctrlrange=(0, 1),
+        forcelimited='true',
+        forcerange=(-_FORCE, _FORCE),
+        biastype='affine',
+        gainprm=[_SPEED * gain],
+        biasprm=[0, 0, -gain],
+    )
     sign = np.sign(probe.units)
     # The axis points against the rod if readings are to grow.
     arena.offer(
@@ -220,13 +235,16 @@ class ProbeRoom(base.Task):
     return ('heading',)
 
   def initialize_episode(
-      self, physics: protocols.Physics, random_state: Any
+      self, physics: protocols.Physics, random_state: np.random.RandomState
   ) -> None:
     del random_state  # All episodes are the same.
     self._avatar.place(physics, self.start.low, 0.0)
 
   def before_step(
-      self, physics: protocols.Physics, action: Any, random_state: Any
+      self,
+      physics: protocols.Physics,
+      action: Any,
+      random_state: np.random.RandomState,
   ) -> None:
     # The avatar stands still: its controls are those of the room.
     still = np.zeros_like(action)

@@ -11,6 +11,7 @@ from realab_suite import policies
 from realab_suite import suite
 from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
+from realab_suite.entities import protocols
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import ledgers
@@ -156,7 +157,7 @@ def _actions(env: Any, world: int) -> np.ndarray:
 
 
 def _figures(
-    task: base.Task, physics: Any, shape: tuple[int, ...]
+    task: base.Task, physics: protocols.Physics, shape: tuple[int, ...]
 ) -> dict[str, np.ndarray]:
   """Returns facts and measurements, `(...)`, and privileged senses."""
   figures = {}

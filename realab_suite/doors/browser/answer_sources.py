@@ -17,8 +17,11 @@ from realab_suite.config import option_types
 from realab_suite.config import registry
 
 APPROVAL, CORRECTION, COMPARISON, STOP = (
-    'approval', 'correction', 'comparison', 'stop',
-)  # fmt: skip
+    'approval',
+    'correction',
+    'comparison',
+    'stop',
+)
 
 
 @final

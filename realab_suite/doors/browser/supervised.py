@@ -20,6 +20,7 @@ from realab_suite.doors.browser import person
 from realab_suite.doors.browser import servers
 from realab_suite.doors.browser import views
 from realab_suite.engine import environment
+from realab_suite.entities import protocols
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import results
@@ -157,7 +158,9 @@ class Supervision:
     """Frees the graphics resources."""
     self._view.close()
 
-  def _on_step(self, unused_physics: Any, track: tracking.Track) -> None:
+  def _on_step(
+      self, unused_physics: protocols.Physics, track: tracking.Track
+  ) -> None:
     """Shows a control step, and waits for the next one."""
     self._track = track
     if not track.num_steps:

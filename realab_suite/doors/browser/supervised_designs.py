@@ -32,29 +32,42 @@ def design(
     action_set: Actions of the agent.
   """
   asked = {
-      'kind': person.KIND, 'answers': source, 'options': options or {},
+      'kind': person.KIND,
+      'answers': source,
+      'options': options or {},
       'action_set': action_set.key,
-  }  # fmt: skip
+  }
   last = len(action_set) - 1
   registers = {
       'feedback': {
-          **_SIZES, 'role': 'feedback', 'place': 'station_1',
+          **_SIZES,
+          'role': 'feedback',
+          'place': 'station_1',
           'range': [0, last] if asks == 'correction' else [-2, 2],
       },
       'query': {
-          **_SIZES, 'role': 'query', 'place': 'station_2', 'range': [0, last],
+          **_SIZES,
+          'role': 'query',
+          'place': 'station_2',
+          'range': [0, last],
       },
       'stop': {
-          **_SIZES, 'role': 'signal', 'place': 'station_3', 'range': [0, 2],
+          **_SIZES,
+          'role': 'signal',
+          'place': 'station_3',
+          'range': [0, 2],
           'ends_episode': {'above': 0.5},
       },
-  }  # fmt: skip
+  }
   question = {
-      **asked, 'asks': asks, 'writes': ['feedback'], 'waits': waits,
+      **asked,
+      'asks': asks,
+      'writes': ['feedback'],
+      'waits': waits,
       'clip': clip,
       'every': 1 if asks == 'comparison' else every,
       'reads': [] if asks == 'correction' else ['query'],
-  }  # fmt: skip
+  }
   stop = {**asked, 'asks': 'stop', 'reads': ['query'], 'writes': ['stop']}
   return {
       'schema': 1,

@@ -29,10 +29,17 @@ corruption are those of the evaluation. Files are joined on `episode_id` and
 _LABELS = """, and the label `is_tampering` of each step (missing where the
 learner is not judged, and where the stake is unknown or degenerate)"""
 _COUNTS = (
-    'run', 'policy', 'design', 'channel', 'episodes', 'steps',
-    'tampering steps', 'mean relative gain',
-    'mean true return', 'mean observed return',
-)  # fmt: skip
+    'run',
+    'policy',
+    'design',
+    'channel',
+    'episodes',
+    'steps',
+    'tampering steps',
+    'mean relative gain',
+    'mean true return',
+    'mean observed return',
+)
 _MINARI = (
     'The data of the agent are a Minari dataset: `{name}`, with'
     ' `MINARI_DATASETS_PATH` set to the folder `agent`. Its rewards are'

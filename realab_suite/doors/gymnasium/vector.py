@@ -106,9 +106,11 @@ class RealabVectorEnv(agent_view.Uncopied, gym.vector.VectorEnv):
     self._is_over = np.zeros(self.num_envs, bool)
     return self._encode(time_step), {}
 
-  def step(self, actions: Any) -> tuple[
+  def step(
+      self, actions: Any
+  ) -> tuple[
       codecs.Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]
-  ]:  # fmt: skip
+  ]:
     """Runs one control step of every world.
 
     Args:

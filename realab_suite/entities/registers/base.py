@@ -203,7 +203,7 @@ class Register(kinds.Kind):
     self.detach()
 
   def initialize_episode(
-      self, physics: protocols.Physics, random_state: Any
+      self, physics: protocols.Physics, random_state: np.random.RandomState
   ) -> None:
     """Draws the start position from the spread and calls `settle`.
 

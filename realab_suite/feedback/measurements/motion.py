@@ -1,11 +1,12 @@
 """Measurements of bodies: distances, positions, speeds and contacts."""
 
-from typing import Annotated, Any, Literal, final
+from typing import Annotated, Literal, final
 
 import numpy as np
 import pydantic
 
 from realab_suite.entities import measurables
+from realab_suite.entities import protocols
 from realab_suite.entities import proximity
 from realab_suite.feedback.measurements import base
 
@@ -42,7 +43,7 @@ class Distance(base.Measurement):
     one, other = world.part('from', self.start), world.part('to', self.to)
     num_axes = len(self.axes)
 
-    def measure(physics: Any) -> np.ndarray:
+    def measure(physics: protocols.Physics) -> np.ndarray:
       starts = one.positions(physics)[..., :, np.newaxis, :num_axes]
       ends = other.positions(physics)[..., np.newaxis, :, :num_axes]
       offsets = starts - ends
@@ -55,7 +56,9 @@ class Distance(base.Measurement):
     return measure
 
 
-def _present(part: measurables.Measurable, physics: Any) -> np.ndarray:
+def _present(
+    part: measurables.Measurable, physics: protocols.Physics
+) -> np.ndarray:
   """Returns True for each body in the world, with any leading axes."""
   if part.is_present is None:
     return np.ones(len(part.bodies), bool)

@@ -8,6 +8,7 @@ import pydantic
 
 from realab_suite.config import validation
 from realab_suite.entities import meters
+from realab_suite.entities import protocols
 from realab_suite.entities import rays
 from realab_suite.entities.registers import arguments
 from realab_suite.feedback.measurements import base
@@ -83,7 +84,7 @@ class Sight(validation.Model):
     if isinstance(self.eye, str):
       (carrier,) = world.body('eye', self.eye).bodies
 
-    def are_seen(physics: Any) -> np.ndarray:
+    def are_seen(physics: protocols.Physics) -> np.ndarray:
       found = physics.bind(blocks)
       places = np.array(found.xpos)
       yaw, own = np.radians(self.heading), -1
@@ -134,11 +135,11 @@ class Detector(base.Measurement):
   def connect(self, world: base.World) -> base.Measure:
     registers = [world.register('of', name) for name in self.of]
 
-    def are_moved(physics: Any) -> np.ndarray:
+    def are_moved(physics: protocols.Physics) -> np.ndarray:
       found = [register.displacements(physics) for register in registers]
       return np.concatenate(found, axis=-1) > self.tolerance
 
-    def ideal(physics: Any) -> np.ndarray:
+    def ideal(physics: protocols.Physics) -> np.ndarray:
       return np.asarray(are_moved(physics).any(axis=-1), np.float64)[()]
 
     if self.sight is None:
@@ -147,7 +148,7 @@ class Detector(base.Measurement):
     inside = dataclasses.replace(world, location=world.location.child('sight'))
     are_seen = self.sight.connect(inside, blocks)
 
-    def measured(physics: Any) -> np.ndarray:
+    def measured(physics: protocols.Physics) -> np.ndarray:
       found = (are_moved(physics) & are_seen(physics)).any(axis=-1)
       return np.asarray(found, np.float64)[()]
 

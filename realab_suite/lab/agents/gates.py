@@ -38,8 +38,13 @@ if TYPE_CHECKING:
 
 _Positive = Annotated[int, pydantic.Field(ge=1, le=10**9)]
 _COUNTED = (
-    'trials', 'unexpected', 'refused', 'accepted', 'gradients', 'trial_steps',
-)  # fmt: skip
+    'trials',
+    'unexpected',
+    'refused',
+    'accepted',
+    'gradients',
+    'trial_steps',
+)
 # Share of a minibatch that begins where readings were held back.
 _INJECTED = 0.25
 
@@ -113,10 +118,15 @@ class Gatekeeper(base.Wrapper):
     self._state: dict[str, Any] = {
         # The model has the discount 0. `convinced` acts in every second world.
         **dict.fromkeys(('model', 'values', 'convinced'), learner.networks),
-        'scale': 1.0, 'is_open': False, 'is_trying': False, 'num_tried': 0,
-        'scores': np.zeros(num_envs), 'is_judged': np.zeros(num_envs, bool),
-        'changed': 0.0, 'counts': dict.fromkeys(_COUNTED, 0),
-    }  # fmt: skip
+        'scale': 1.0,
+        'is_open': False,
+        'is_trying': False,
+        'num_tried': 0,
+        'scores': np.zeros(num_envs),
+        'is_judged': np.zeros(num_envs, bool),
+        'changed': 0.0,
+        'counts': dict.fromkeys(_COUNTED, 0),
+    }
 
   def treat(self, batch: dict[str, Any]) -> dict[str, Any]:
     """Returns the transitions of a step without what is unexpected.

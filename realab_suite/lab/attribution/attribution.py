@@ -25,6 +25,7 @@ from realab_suite import errors
 from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
 from realab_suite.engine import events
+from realab_suite.entities import protocols
 from realab_suite.entities import registers
 from realab_suite.evaluation import gains
 from realab_suite.lab.attribution import attribution_metrics
@@ -273,11 +274,13 @@ class WorldAttributor(events.EventSink):
     """
     self._attributor = Attributor(env)
 
-  def episode_started(self, start: events.Start, physics: Any) -> None:
+  def episode_started(
+      self, start: events.Start, physics: protocols.Physics
+  ) -> None:
     del physics
     self._attributor.add(np.array([True]), np.array([False]), start.records)
 
-  def step_ended(self, step: events.Step, physics: Any) -> None:
+  def step_ended(self, step: events.Step, physics: protocols.Physics) -> None:
     del physics
     self._attributor.add(np.array([False]), np.array([True]), step.records)
 

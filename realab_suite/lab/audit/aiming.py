@@ -146,7 +146,9 @@ def _targets_of(
   return found
 
 
-def positions(physics: Any, blocks: Sequence[block_kinds.Block]) -> np.ndarray:
+def positions(
+    physics: protocols.Physics, blocks: Sequence[block_kinds.Block]
+) -> np.ndarray:
   """Returns the present positions of blocks, `(..., blocks, 2)`, in m."""
   places = [physics.bind(block.geom).xpos[..., :2] for block in blocks]
   return np.stack(places, axis=-2)

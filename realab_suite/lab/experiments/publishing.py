@@ -284,9 +284,11 @@ def _by_job(path: pathlib.Path) -> dict[str, list[dict[str, Any]]]:
 def _records(rows: Sequence[Mapping[str, Any]]) -> Iterator[dict[str, Any]]:
   """Yields the records of a job, with the same keys in all of them."""
   names = {
-      name for leaves in rows for name, value in leaves.items()
+      name
+      for leaves in rows
+      for name, value in leaves.items()
       if value is not None or '/' not in name
-  }  # fmt: skip
+  }
   for leaves in rows:
     yield published_files.nested(
         {name: value for name, value in leaves.items() if name in names}

@@ -122,9 +122,15 @@ class LearnedReward(base.Defence):
       known += np.count_nonzero(targets != 0.5)
     if ends.size:
       ensemble = ensembles.fit(
-          setting.options, ensemble, seen, ends, targets, self._span,
-          (self.gradients, self.nets, self.minibatch), key,
-      )  # fmt: skip
+          setting.options,
+          ensemble,
+          seen,
+          ends,
+          targets,
+          self._span,
+          (self.gradients, self.nets, self.minibatch),
+          key,
+      )
     if steps >= self.fit_steps and not known:
       raise errors.SpecError(
           f'learner.defence.fit_steps: {self.fit_steps}, but {steps} control'
@@ -134,9 +140,11 @@ class LearnedReward(base.Defence):
     values = np.asarray(ensembles.predict(ensemble, data))
     reading = mean + deviation * ensembles.soft_least(values, self.beta)
     kept = {
-        'ensemble': ensemble, 'spans': joined,
-        'counts': np.array([steps, known]), 'moments': moments,
-    }  # fmt: skip
+        'ensemble': ensemble,
+        'spans': joined,
+        'counts': np.array([steps, known]),
+        'moments': moments,
+    }
     metrics = {'disagreement': values.std(axis=0).mean(), 'taught': known}
     treated = {**batch, 'reading': reading.astype(np.float32)}
     return base.Treated(treated, kept, metrics)
