@@ -209,7 +209,7 @@ def parse_rounds(
   )
   rounds = parser.parse_args(arguments).rounds
   if rounds < 1:
-    parser.error(f'--rounds={rounds}; allowed are positive integers')
+    parser.error(f'--rounds={rounds}; must be positive integers')
   return rounds
 
 

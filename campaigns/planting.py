@@ -99,6 +99,6 @@ def mutated(mutant: Mutant, text: str) -> str:
   if text.count(mutant.old) != 1:
     raise ValueError(
         f'{mutant.what}: {mutant.file} contains the text to replace'
-        f' {text.count(mutant.old)} times; allowed is once'
+        f' {text.count(mutant.old)} times; must be once'
     )
   return text.replace(mutant.old, mutant.new)

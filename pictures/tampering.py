@@ -86,7 +86,7 @@ def draw(path: pathlib.Path, folder: pathlib.Path) -> None:
   typical = replays.typical_row(runs['reward']) if 'reward' in runs else None
   if typical is None:
     raise errors.ResultsError(
-        f'{folder}: no valid episode of a run named reward; allowed are'
+        f'{folder}: no valid episode of a run named reward; must be'
         ' finished sweeps of the experiment quick'
     )
   panels = [_replay(folder, runs.get(name), typical) for name in _TITLES]
@@ -112,7 +112,7 @@ def _replay(
   if run is None or not rows:
     raise errors.ResultsError(
         f'{folder}: no episode of the secure twin with (seed, world, episode)'
-        f' {world}; allowed are finished sweeps of the experiment quick'
+        f' {world}; must be finished sweeps of the experiment quick'
     )
   moments: list[_Moment] = []
 

@@ -191,7 +191,7 @@ def _encode(where: str, value: Any, arrays: list[np.ndarray]) -> list[Any]:
     arrays.append(np.array(value))
     return ['scalar' if is_scalar else 'array', len(arrays) - 1]
   raise errors.StateLayoutError(
-      f'{where} is a {kind.__name__}: {value!r:.60}; allowed are tuples, lists'
+      f'{where} is a {kind.__name__}: {value!r:.60}; must be tuples, lists'
       ' and dicts (with strings as keys) of arrays, numbers, strings and None'
   )
 
@@ -223,8 +223,6 @@ def _read(payload: bytes) -> tuple[dict[str, Any], Any]:
   with np.load(io.BytesIO(payload), allow_pickle=False) as file:
     header, tree = json.loads(file[_STRUCTURE].tobytes())
     if header['format'] != _FORMAT:
-      raise ValueError(
-          f'format is {header["format"]!r:.20}; allowed is {_FORMAT}'
-      )
+      raise ValueError(f'format is {header["format"]!r:.20}; must be {_FORMAT}')
     arrays = [file[str(i)] for i in range(len(file.files) - 1)]
   return header, _decode(tree, arrays)

@@ -210,7 +210,7 @@ def load(
   if visualize_reward is not False:
     raise errors.SpecError(
         f'visualize_reward={messages.quote(visualize_reward)} would show the'
-        ' true reward to the agent; allowed is False'
+        ' true reward to the agent; must be False'
     )
   domain_name, task_name = _names(domain_name, task_name)
   factory = registry.find(domain_name, task_name)
@@ -222,8 +222,8 @@ def load(
   if unknown := [key for key in options if key not in known]:
     raise errors.SpecError(
         f'environment_kwargs: unknown {messages.quote(unknown)}'
-        f'{messages.did_you_mean(unknown[0], known)}; allowed are max_steps,'
-        ' senses and world'
+        f'{messages.did_you_mean(unknown[0], known)}; must be max_steps,'
+        ' senses or world'
     )
   kwargs = _keywords('task_kwargs', task_kwargs)
   random = kwargs.pop('random', None)
@@ -256,7 +256,8 @@ def _problem_of_arguments(
       if key not in names:
         return (
             f'unknown argument {messages.quote(key)}'
-            f'{hint or messages.did_you_mean(key, names)}; allowed are {names}'
+            f'{hint or messages.did_you_mean(key, names)}; must be one of'
+            f' {names}'
         )
   return f'{messages.exception(error)}{hint}'
 
@@ -298,7 +299,7 @@ def load_batch(
   if 'world' in _keywords('environment_kwargs', environment_kwargs):
     raise errors.SpecError(
         'environment_kwargs: unknown world: a batch contains all worlds from'
-        ' 0; allowed are max_steps and senses'
+        ' 0'
     )
   num_envs = arguments.num_envs(num_envs)
   num_threads = arguments.num_threads(num_threads)
@@ -375,12 +376,12 @@ def embed(
   """
   if not isinstance(task, composer.Task):
     raise errors.SpecError(
-        f'task: {messages.quote(task)}; allowed are Composer tasks'
+        f'task: {messages.quote(task)}; must be a Composer task'
     )
   if isinstance(task.observables, list | tuple):
     raise errors.SpecError(
         f'task: {type(task).__name__} has {len(task.observables)} agents;'
-        ' allowed are tasks with one agent'
+        ' must have one'
     )
   world = integers.check('world', world, 0)
   seed = seeding.as_seed(random)
@@ -392,7 +393,7 @@ def embed(
     if not callable(measure):
       raise errors.SpecError(
           f'measurements: {messages.quote(name)}: {messages.quote(measure)};'
-          ' allowed is a function of the physics'
+          ' must be a function of the physics'
       )
   mechanism = mechanisms.FeedbackMechanism(
       specs.load(design, overrides).in_world(getattr(task, 'SOLVER', None))
@@ -452,7 +453,7 @@ def _keywords(argument: str, value: Any) -> dict[str, Any]:
       isinstance(key, str) for key in value
   ):
     raise errors.SpecError(
-        f'{argument}: {messages.quote(value)}; allowed is a mapping with'
-        ' strings as keys, and None'
+        f'{argument}: {messages.quote(value)}; must be a mapping with'
+        ' strings as keys, or None'
     )
   return dict(value)

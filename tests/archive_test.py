@@ -163,9 +163,7 @@ def test_malformed_archives_are_refused(data):
 
 def test_another_format_is_named():
   data = _archive([{'format': 2}, ['plain', 1]])
-  with pytest.raises(
-      errors.StateLayoutError, match='format is 2; allowed is 1'
-  ):
+  with pytest.raises(errors.StateLayoutError, match='format is 2; must be 1'):
     archive.Archive.from_bytes(data)
 
 

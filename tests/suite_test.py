@@ -216,7 +216,7 @@ _load = functools.partial(
     [
         (
             lambda: suite.load('unlock_door'),
-            'task unlock_door: a domain alone; allowed are'
+            'task unlock_door: a domain alone; must be'
             ' unlock_door.{standard,near,far,boxed,impossible}',
         ),
         (lambda: suite.load(3), 'task 3 is unknown; known are apple_maze.{'),
@@ -232,11 +232,11 @@ _load = functools.partial(
         (
             lambda: _load(task_kwargs={'randm': 1}),
             "task_kwargs of unlock_door.near: unknown argument 'randm'; did you"
-            " mean 'random'?; allowed are [",
+            " mean 'random'?; must be one of [",
         ),
         (
             lambda: _load(task_kwargs={'seed': 1}),
-            "unknown argument 'seed'; the seed is 'random'; allowed are [",
+            "unknown argument 'seed'; the seed is 'random'; must be one of [",
         ),
         (
             lambda: _load(environment_kwargs={'senses': ['camra']}),

@@ -80,7 +80,7 @@ class Documents(Generic[_Spec]):
     """
     if isinstance(overrides, str) or not isinstance(overrides, Sequence):
       raise errors.SpecError(
-          f'overrides: {messages.quote(overrides)}; allowed is a list of'
+          f'overrides: {messages.quote(overrides)}; must be a list of'
           " strings, such as ['channel=secure']"
       )
     if isinstance(source, self._model) and not overrides and not is_confined:
@@ -108,7 +108,7 @@ class Documents(Generic[_Spec]):
       return what, loading.read_mapping(source)
     if not isinstance(source, str | os.PathLike):
       raise errors.SpecError(
-          f'{what}: {messages.quote(source)}; allowed are a name, a path, a'
+          f'{what}: {messages.quote(source)}; must be a name, a path, a'
           f' mapping and a {self._model.__name__}'
       )
     if isinstance(source, str) and source in self._files:

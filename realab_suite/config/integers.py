@@ -41,6 +41,6 @@ def check(
     return int(given)
   limit = '' if high in (None, LARGEST) else f' to {high}'
   raise error(
-      f'{name}: {messages.quote(given)}; allowed are integers from'
+      f'{name}: {messages.quote(given)}; must be an integer from'
       f' {low}{limit}{more}'
   )

@@ -166,8 +166,8 @@ def apply_overrides(
         parent = messages.quote('.'.join(keys[:depth]))
         raise messages.Location(where).error(
             f'{messages.quote(key)} is not in {parent}, which is'
-            f' {messages.quote(node)}; allowed are keys of mappings and indices'
-            ' of lists'
+            f' {messages.quote(node)}; must be a key of a mapping or an index'
+            ' of a list'
         )
       if depth == len(keys) - 1:
         node[position] = value

@@ -44,7 +44,7 @@ class Registry(Generic[T]):
       if name in self._entries:
         raise errors.SpecError(
             f'{self._what} {name!r} is registered already, as'
-            f' {messages.quote(self._entries[name])}; allowed is another name;'
+            f' {messages.quote(self._entries[name])}; choose another name;'
             ' in a notebook, run the cell that registers it once'
         )
       self._entries[name] = entry

@@ -191,7 +191,7 @@ def _element_names(control_spec: Any) -> list[str]:
   )
   if not is_vector:
     raise errors.SpecError(
-        f'action_spec of the task: {control_spec!r:.160}; allowed is a'
+        f'action_spec of the task: {control_spec!r:.160}; must be a'
         ' BoundedArray of numbers with one axis'
     )
   names = (control_spec.name or '').split('\t')

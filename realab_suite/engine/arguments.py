@@ -59,7 +59,7 @@ def indices(given: Any, num_envs: int) -> np.ndarray:
       or len(set(given)) < len(given)
   ):
     raise errors.SpecError(
-        f'worlds: {messages.quote(given)}; allowed are integers from 0 to'
+        f'worlds: {messages.quote(given)}; must be an integer from 0 to'
         f' {num_envs - 1}, each once'
     )
   return np.array(given)
@@ -80,7 +80,7 @@ def sources(given: Any, number: int, has_begun: np.ndarray) -> np.ndarray:
   found = np.array(given)
   if len(found) != number or not has_begun[found].all():
     raise errors.SpecError(
-        f'sources: {messages.quote(given)}; allowed are {number} indices of'
+        f'sources: {messages.quote(given)}; must be {number} indices of'
         ' worlds that have begun an episode'
     )
   return found
@@ -100,8 +100,8 @@ def senses(given: Any) -> tuple[str, ...] | None:
       or len(set(given)) < len(given)
   ):
     raise errors.SpecError(
-        f'senses: {messages.quote(given)}; allowed are a list of names, each'
-        ' once, and None'
+        f'senses: {messages.quote(given)}; must be a list of names, each'
+        ' once, or None'
     )
   return tuple(given)
 
@@ -114,7 +114,7 @@ def camera(given: Any, mjcf_model: Any) -> str:
   """
   names = [one.full_identifier for one in mjcf_model.find_all('camera')]
   if given not in names:
-    raise errors.SpecError(f'camera: {given!r}; allowed are {names}')
+    raise errors.SpecError(f'camera: {given!r}; must be one of {names}')
   return str(given)
 
 
@@ -130,6 +130,6 @@ def flag(name: str, given: Any) -> bool:
   """
   if not isinstance(given, bool | np.bool_):
     raise errors.SpecError(
-        f'{name}: {messages.quote(given)}; allowed are True and False'
+        f'{name}: {messages.quote(given)}; must be True or False'
     )
   return bool(given)

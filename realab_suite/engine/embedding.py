@@ -39,7 +39,7 @@ def connect_meters(
   for name in added:
     if name in functions:
       raise errors.SpecError(
-          f'measurements: {name!r} is measured by the task; allowed are names'
+          f'measurements: {name!r} is measured by the task; must be a name'
           f' other than {sorted(functions)}'
       )
   privileged = getattr(task, 'privileged_senses', {})

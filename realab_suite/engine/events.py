@@ -208,6 +208,6 @@ class BatchEventSink(abc.ABC):
 
 def _unsaveable(sink: EventSink | BatchEventSink) -> errors.SpecError:
   return errors.SpecError(
-      f'{type(sink).__name__} cannot be saved; allowed are sinks that'
-      ' implement state and set_state'
+      f'{type(sink).__name__} cannot be saved; a sink must'
+      ' implement state and set_state to be saved'
   )

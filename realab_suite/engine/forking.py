@@ -50,12 +50,12 @@ def fork(
       isinstance(sink, events.BatchEventSink) for sink in sinks
   ):
     raise errors.SpecError(
-        f'sinks: {messages.quote(sinks)}; allowed is a list of BatchEventSinks'
+        f'sinks: {messages.quote(sinks)}; must be a list of BatchEventSinks'
     )
   if isinstance(env, batch_environment.BatchEnvironment):
     if world is None:
       raise errors.SpecError(
-          f'world: None; allowed are integers from 0 to {env.num_envs - 1}'
+          f'world: None; must be an integer from 0 to {env.num_envs - 1}'
       )
     # Called on the class, because to mypy `env` may also be an `Environment`,
     # which is `Any`.
@@ -64,13 +64,13 @@ def fork(
   elif isinstance(env, environment.Environment):
     if world is not None:
       raise errors.SpecError(
-          f'world: {messages.quote(world)}; allowed is None, because env is not'
+          f'world: {messages.quote(world)}; must be None, because env is not'
           ' a batch'
       )
     snapshot, single = env.save(), env
   else:
     raise errors.SpecError(
-        f'env: {messages.quote(env)}; allowed are environments of this package'
+        f'env: {messages.quote(env)}; must be an environment of this package'
     )
   hooks.refuse_in_batch(single.task, single.has_extra_hooks)
   # The model is compiled again, because closing an environment frees its model.

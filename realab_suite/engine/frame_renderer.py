@@ -110,7 +110,7 @@ class FrameRenderer:
     _refuse_forks()
     if threading.current_thread() is not self._thread:
       raise errors.RenderingError(
-          f'camera: rendering in {threading.current_thread().name}; allowed is'
+          f'camera: rendering in {threading.current_thread().name}; must be'
           ' the thread that rendered the first frame'
       )
     self._camera.fixedcamid = camera_id

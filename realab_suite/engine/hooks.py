@@ -31,7 +31,7 @@ def refuse_unused(task: composer.Task, hook_name: str) -> None:
     raise errors.SpecError(
         f'add_extra_hook: {hook_name!r} is never called in'
         f' {type(task).__name__}, which is compiled once and has no Python'
-        f' in substeps; allowed are {allowed}'
+        f' in substeps; must be one of {allowed}'
     )
 
 
@@ -73,10 +73,7 @@ def refuse_in_batch(task: composer.Task, has_extra_hooks: bool) -> None:
         ' tasks of this package: step environments with world=i instead'
     )
   if has_extra_hooks:
-    raise errors.SpecError(
-        'add_extra_hook: a batch never calls extra hooks; allowed is an'
-        ' environment without them'
-    )
+    raise errors.SpecError('add_extra_hook: a batch never calls extra hooks')
   for entity in task.root_entity.iter_entities():
     for hook in ('before_step', 'after_step'):
       if getattr(type(entity), hook) is not getattr(composer.Entity, hook):

@@ -356,7 +356,7 @@ class WorldHost(Host):
     where = f'{type(self._task).__name__}.senses'
     if sensed.keys() != set(names):
       raise errors.SpecError(
-          f'{where}: keys {sorted(sensed)}; allowed are the selected keys of'
+          f'{where}: keys {sorted(sensed)}; must be the selected keys of'
           f' sense_spec, {sorted(names)}'
       )
     for name, value in sensed.items():
@@ -365,7 +365,7 @@ class WorldHost(Host):
       if given != (shape, dtype):
         break
     raise errors.SpecError(
-        f'{where}: {name!r} is {messages.quote(value)}; allowed is'
+        f'{where}: {name!r} is {messages.quote(value)}; must be'
         f' {dtype} of shape {shape}'
     )
 

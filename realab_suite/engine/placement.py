@@ -225,7 +225,7 @@ class StartCheck:
       raise composer.EpisodeInitializationError(
           f'design {self._design!r}: register {register.name!r}'
           f' {blocks.describe(i)}, inside {others.names[j]!r} when the episode'
-          ' begins; allowed are places that the task keeps clear; place the'
+          ' begins; place the'
           ' register elsewhere, narrow its range, or keep the other away'
       )
 

@@ -37,7 +37,7 @@ def as_seed(random: Any) -> int:
   if integers.is_integer(random) and random >= 0:
     return int(random)
   raise errors.SpecError(
-      f'random: {messages.quote(random)}; allowed are a non-negative integer, a'
+      f'random: {messages.quote(random)}; must be a non-negative integer, a'
       ' RandomState or None'
   )
 
@@ -57,7 +57,7 @@ def seeds(random: Any, num_envs: int) -> np.ndarray:
     random = [as_seed(random)] * num_envs
   if len(random) != num_envs:
     raise errors.SpecError(
-        f'random: {len(random)} seeds; allowed are one seed, and {num_envs}'
+        f'random: {len(random)} seeds; must be one seed, or {num_envs}'
         ' seeds, one for each world'
     )
   # Objects keep large seeds.

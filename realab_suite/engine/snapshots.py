@@ -140,7 +140,7 @@ class WorldStates(NamedTuple):
     """
     if not isinstance(snapshot, Snapshot):
       raise errors.StateLayoutError(
-          f'snapshot: {messages.quote(snapshot)}; allowed is a Snapshot, as'
+          f'snapshot: {messages.quote(snapshot)}; must be a Snapshot, as'
           ' from `save` or `Snapshot.from_bytes`'
       )
     return cls.from_data(snapshot.contents_for(header))
@@ -194,7 +194,7 @@ class WorldStates(NamedTuple):
     if len(self.seed) not in (1, len(indices)):
       raise errors.StateLayoutError(
           f'the snapshot has {len(self.seed)} worlds, for {len(indices)} here;'
-          ' allowed are the same number, or one'
+          ' must have the same number, or one'
       )
     return indices
 
@@ -212,7 +212,7 @@ class WorldStates(NamedTuple):
     if kinds and kinds != saved:
       raise errors.StateLayoutError(
           f'the snapshot was saved with sinks {saved}; this environment has'
-          f' {kinds}; allowed are the same sinks, or none here'
+          f' {kinds}; must be the same sinks, or none here'
       )
 
   def merged_into(

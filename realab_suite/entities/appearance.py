@@ -70,7 +70,7 @@ def _checked_colour(where: str, rgba: Any) -> _Colour | None:
     colour = np.zeros(0)
   if colour.shape != (4,) or not ((0.0 <= colour) & (colour <= 1.0)).all():
     raise errors.SpecError(
-        f'{where}: rgba {rgba!r:.80}; allowed are four numbers from 0 to 1, and'
+        f'{where}: rgba {rgba!r:.80}; must be four numbers from 0 to 1, or'
         ' None'
     )
   return tuple(colour.tolist())
@@ -96,7 +96,7 @@ def register(
   """
   if not (isinstance(name, str) and name):
     raise errors.SpecError(
-        f'class of objects: name {name!r:.80}; allowed are non-empty strings'
+        f'class of objects: name {name!r:.80}; must be a non-empty string'
     )
   where = f'class of objects {name!r:.80}'
   if name in _CLASSES:
@@ -110,7 +110,7 @@ def register(
     owner = owners.get(code) if type(code) is int else None
     taken = '' if owner is None else f' is that of {owner!r}'
     raise errors.SpecError(
-        f'{where}: code {code!r:.80}{taken}; allowed are {free}'
+        f'{where}: code {code!r:.80}{taken}; must be one of {free}'
     )
   _CLASSES[name] = _Class(code, _checked_colour(where, rgba))
   return name
@@ -172,7 +172,7 @@ def geom_style(name: str, rgba: Any = None) -> dict[str, Any]:
   colour = found.rgba if rgba is None else rgba
   if colour is None:
     raise errors.SpecError(
-        f'class of objects {name!r:.80}: rgba None; allowed is a colour,'
+        f'class of objects {name!r:.80}: rgba None; must be a colour,'
         ' because the class has none'
     )
   return {'user': [found.code], 'rgba': colour}

@@ -60,10 +60,10 @@ class Apples(measurables.MeasurableEntity):
     """
     if kind not in _SHAPES:
       raise errors.SpecError(
-          f'kind: {kind!r:.80}; allowed are {sorted(_SHAPES)}'
+          f'kind: {kind!r:.80}; must be one of {sorted(_SHAPES)}'
       )
     if number < 1:
-      raise errors.SpecError(f'number: {number}; allowed are 1 and more')
+      raise errors.SpecError(f'number: {number}; must be at least 1')
     self._mjcf_root = mjcf.RootElement(model=name)
     self._eaten = state.Slot(self._mjcf_root, 'eaten', number)
     shape, self._radius = _SHAPES[kind]

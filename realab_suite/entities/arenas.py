@@ -68,7 +68,7 @@ class Place:
       is_valid = False
     if not is_valid:
       raise errors.SpecError(
-          f'{self!r:.160}; allowed are finite numbers, two for the position,'
+          f'{self!r:.160}; must be finite numbers, two for the position,'
           ' one for the yaw, two of at least 0 for the spread, and one of at'
           ' least 0 for the height'
       )
@@ -328,7 +328,7 @@ class RoomArena(composer.Arena):
     """
     if not (min(size) > 0 and 0 < height <= _WALL_HEIGHT):
       raise errors.SpecError(
-          f'table {name!r}: size {tuple(size)} and height {height}; allowed are'
+          f'table {name!r}: size {tuple(size)} and height {height}; must be'
           f' lengths above 0, and heights above 0 up to {_WALL_HEIGHT}'
       )
     x, y = position

@@ -56,7 +56,7 @@ class Crate(measurables.MeasurableEntity):
     ):
       if not isinstance(given, int | float) or not least <= given <= most:
         raise errors.SpecError(
-            f'crate {name!r}: {what} {given!r:.40}; allowed are {least:g} to'
+            f'crate {name!r}: {what} {given!r:.40}; must be from {least:g} to'
             f' {most:g}'
         )
     self._mjcf_root = mjcf.RootElement(model=name)

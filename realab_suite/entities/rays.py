@@ -139,7 +139,7 @@ class RaySense(modelled.ModelledEntity):
     """
     self._mjcf_root = mjcf.RootElement(model=name)
     if num_rays < 2:
-      raise errors.SpecError(f'num_rays: {num_rays}; allowed are 2 and more')
+      raise errors.SpecError(f'num_rays: {num_rays}; must be at least 2')
     half = np.radians(field_of_view) / 2.0
     # From left to right, as in an image.
     self._angles = np.linspace(half, -half, num_rays)

@@ -330,7 +330,7 @@ def make(
     return PolicyActor(policy, env)
   if not callable(policy):
     raise errors.SpecError(
-        f'policy: {policy!r:.80}; allowed are a policy from policies.make and a'
+        f'policy: {policy!r:.80}; must be a policy from policies.make or a'
         ' function from a time step to an action'
     )
   return PlainActor(policy)

@@ -57,7 +57,7 @@ def evaluate(
   """
   if not isinstance(env, environment.Environment):
     raise errors.ResultsError(
-        f'env: {type(env).__name__}; allowed is an Environment from suite.load'
+        f'env: {type(env).__name__}; must be an Environment from suite.load'
     )
   actor = actors.make(policy, env)
 

@@ -365,12 +365,12 @@ def _check(
     if name not in readable:
       raise errors.SpecError(
           f'objective: {messages.quote(name)} is not a register that agents'
-          f' read; allowed are {readable}'
+          f' read; must be one of {readable}'
       )
   if objective.kind == objectives.AGREEMENT and design.action_set is None:
     raise errors.SpecError(
-        'objective: an agreement needs actions with indices; allowed are'
-        ' designs with an action_set'
+        'objective: an agreement needs actions with indices, so the'
+        ' design must have an action_set'
     )
 
 

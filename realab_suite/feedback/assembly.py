@@ -64,8 +64,8 @@ def find_place(
   if place not in named_places:
     raise errors.SpecError(
         f'registers.{name}.place: this world has no place {place!r}'
-        f'{messages.did_you_mean(place, named_places)}; allowed are'
-        f' {sorted(named_places) or "coordinates"}'
+        f'{messages.did_you_mean(place, named_places)}; must be'
+        f' one of {sorted(named_places)} or coordinates'
     )
   return named_places[place]
 

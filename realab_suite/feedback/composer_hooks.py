@@ -98,7 +98,7 @@ class ComposerHooks(composer.Entity):
       raise errors.SpecError(
           f'design {self._mechanism.design.name!r}: the task is in two'
           ' environments, and the registers are in the one that was made last;'
-          ' allowed is a task for each environment'
+          ' make a task for each environment'
       )
     self._view.open(physics)
     self._observation = {
@@ -146,7 +146,7 @@ class ComposerHooks(composer.Entity):
     # MuJoCo's counts of warnings show a failure, which ends a step early.
     if done != expected and not physics.data.ptr.warning.number.any():
       raise errors.SpecError(
-          f'num_substeps: {expected}; allowed is {done}, as in a control step'
+          f'num_substeps: {expected}; must be {done}, as in a control step'
           ' of this environment'
       )
     self._mechanism.phases.end_step(physics, 0.0)

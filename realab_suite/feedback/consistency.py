@@ -79,8 +79,8 @@ def _expect_role(
   role = design.ports[name].role
   if roles is not None and role not in roles:
     raise ValueError(
-        f'{where}: register {name!r} has role {role!r}; allowed are'
-        f' {list(roles)}'
+        f'{where}: register {name!r} has role {role!r}; must be one'
+        f' of {list(roles)}'
     )
 
 
@@ -90,7 +90,7 @@ def _refuse_duplicates(where: str, names: Sequence[str]) -> None:
   for name in names:
     if name in seen:
       raise ValueError(
-          f'{where}: register {name!r} is listed twice; allowed is once'
+          f'{where}: register {name!r} is listed twice; must be listed once'
       )
     seen.add(name)
 
@@ -103,7 +103,7 @@ def _refuse_equal_ports(design: Any) -> None:
       if name in owners:
         raise ValueError(
             f'registers.{register}: its port {name!r} has the name of a port of'
-            f' {owners[name]!r}; allowed are other names'
+            f' {owners[name]!r}; must have another name'
         )
       owners[name] = register
 
@@ -122,7 +122,7 @@ def _refuse_parts(design: Any) -> None:
       if 0 < len(left_out) < len(names):
         raise ValueError(
             f'{where}: port {left_out[0]!r} of register {register!r} is left'
-            f' out; allowed are all of {names}, or none'
+            f' out; list all of {names}, or none'
         )
 
 
@@ -145,7 +145,7 @@ def _refuse_unwritten(design: Any) -> None:
       ):
         raise ValueError(
             f'providers[{i}].reads: no meter writes the register {name!r};'
-            ' allowed are an entry of meters that does, such as {measures:'
+            ' add an entry of meters that does, such as {measures:'
             f' score, writes: {name}}}, and a stated initial, which the'
             ' register keeps'
         )
@@ -158,7 +158,7 @@ def _refuse_unwritten(design: Any) -> None:
     ):
       raise ValueError(
           f'registers.{register}: no provider writes this {spec.role} register;'
-          ' allowed are an entry of providers that does, such as {kind:'
+          ' add an entry of providers that does, such as {kind:'
           f' difference, reads: [score], writes: [{names[0]}]}}, and a stated'
           ' initial, which the register keeps'
       )
@@ -175,7 +175,7 @@ def _refuse_second_writers(design: Any) -> None:
       if name in writers:
         raise ValueError(
             f'{where}.writes: register {name!r} is written by {writers[name]}'
-            ' already; allowed is one writer'
+            ' already; a register must have one writer'
         )
       writers[name] = where
 
@@ -250,5 +250,5 @@ def _check_learner(design: Any) -> None:
       if name not in known:
         raise ValueError(
             f'learner: {messages.quote(name)} is not a {what}'
-            f'{messages.did_you_mean(name, known)}; allowed are {known}'
+            f'{messages.did_you_mean(name, known)}; must be one of {known}'
         )

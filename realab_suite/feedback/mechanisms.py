@@ -68,7 +68,7 @@ class FeedbackMechanism(modelled.ModelledEntity):
     """
     if not isinstance(design, specs.DesignSpec):
       raise errors.SpecError(
-          f'design: {messages.quote(design)}; allowed is a DesignSpec, as from'
+          f'design: {messages.quote(design)}; must be a DesignSpec, as from'
           ' specs.load(name_or_file_or_dict)'
       )
     if num_substeps is not None:
@@ -240,7 +240,7 @@ class FeedbackMechanism(modelled.ModelledEntity):
         raise errors.SpecError(
             f'design {self._design.name!r}: the task already contains the'
             f' registers of design {entity.design.name!r}, which would stay in'
-            ' the world; allowed is a task without registers: make a new one'
+            ' the world; make a new task'
         )
     named_places = root.places if isinstance(root, arenas.RoomArena) else {}
     places = {
@@ -303,8 +303,8 @@ class FeedbackMechanism(modelled.ModelledEntity):
           raise errors.SpecError(
               f'design {self._design.name!r}: registers.{name}.initial: this'
               f' world does not offer {initial!r}'
-              f'{messages.did_you_mean(initial, functions)}; allowed are'
-              f' numbers and {sorted(functions)}'
+              f'{messages.did_you_mean(initial, functions)}; must be'
+              f' numbers or one of {sorted(functions)}'
           )
         values = [functions[name] for name in names]
         register.start_with(_stacked(values) if register.PORTS else values[0])

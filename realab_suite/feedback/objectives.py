@@ -65,16 +65,14 @@ class ObjectiveSpec(validation.Spec):
   @pydantic.model_validator(mode='after')
   def _consistent(self) -> 'ObjectiveSpec':
     if zero := [name for name, weight in self.registers.items() if not weight]:
-      raise ValueError(
-          f'registers: the weight of {zero[0]!r} is 0; allowed are others'
-      )
+      raise ValueError(f'registers: the weight of {zero[0]!r} must not be 0')
     if self.discount is not None and self.kind != RETURN:
       raise ValueError(
-          f'discount: {self.discount} for a {self.kind}; allowed is a return'
+          f'discount: {self.discount} for a {self.kind}; only a return has one'
       )
     if self.kind == AGREEMENT and list(self.registers.values()) != [1.0]:
       raise ValueError(
-          f'registers: {self.registers} for an agreement; allowed is one'
+          f'registers: {self.registers} for an agreement; must be one'
           ' register with weight 1'
       )
     return self
@@ -143,7 +141,7 @@ def _approval_beside(options: _Options, reward: str) -> Payment:
   approval = _name(options, 'approval', 'defence.')
   if approval == reward:
     raise ValueError(
-        f'defence.approval: {approval!r}; allowed is another register than that'
+        f'defence.approval: {approval!r}; must be another register than that'
         ' of the reward'
     )
   weights = {reward: 1.0, approval: options.get('weight', 1.0)}
@@ -180,8 +178,8 @@ def _payment(defence: Any, reward: str) -> Payment | str:
     return Payment({reward: 1.0})
   if not isinstance(defence, Mapping):
     raise ValueError(
-        f'learner.defence: {messages.quote(defence)}; allowed are a mapping'
-        ' with a kind, and null'
+        f'learner.defence: {messages.quote(defence)}; must be a mapping'
+        ' with a kind, or null'
     )
   kind: Any = defence.get('kind')
   is_name = isinstance(kind, str)
@@ -197,7 +195,7 @@ def _payment(defence: Any, reward: str) -> Payment | str:
     )
   if not isinstance(weights, Mapping) or not any(weights.values()):
     raise ValueError(
-        f'defence {kind!r}: pays {messages.quote(weights)}; allowed are weights'
+        f'defence {kind!r}: pays {messages.quote(weights)}; must map to weights'
         ' by the name of the register, one of which is not 0'
     )
   return Payment(weights, tuple(one.queries) or None)
@@ -325,7 +323,7 @@ def of_learner(learner: Any) -> tuple[ObjectiveSpec | None, str]:
   elif declared is not None:
     raise ValueError(
         f'learner.objective: given for {learner.kind!r}, whose kind declares'
-        ' it; allowed is none'
+        ' it; leave it out'
     )
   else:
     where = 'learner'

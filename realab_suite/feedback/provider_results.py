@@ -42,7 +42,7 @@ def checked(
   """
   if not isinstance(returned, tuple) or len(returned) != 2:
     raise errors.FeedbackProviderError(
-        f'returned {messages.quote(returned)}; allowed is (writes, state)'
+        f'returned {messages.quote(returned)}; must be (writes, state)'
     )
   values, state = returned
   # Almost all are dicts, which the check for mappings is slow for.
@@ -51,7 +51,7 @@ def checked(
     given = sorted(map(str, values)) if is_mapping else values
     raise errors.FeedbackProviderError(
         f'returned writes {messages.quote(given)}; it declares writes to'
-        f' {sorted(provider.writes)}; allowed is a mapping from their names to'
+        f' {sorted(provider.writes)}; must be a mapping from their names to'
         ' values'
     )
   return {
@@ -110,7 +110,7 @@ def _checked_write(
       np.asarray(mask).dtype != bool or np.shape(mask) != shape
   ):
     raise errors.FeedbackProviderError(
-        f'wrote {messages.quote(write)} to {name!r}; allowed is a value, or a'
+        f'wrote {messages.quote(write)} to {name!r}; must be a value, or a'
         f' tuple (value, mask) with a mask of bool of shape {shape}'
     )
   return RequestedWrite(
@@ -135,11 +135,11 @@ def _checked_value(name: str, value: Any, shape: tuple[int, ...]) -> Any:
     ) from error
   if number.dtype.kind not in 'iuf' or np.ma.isMaskedArray(value):
     raise errors.FeedbackProviderError(
-        f'wrote {messages.quote(value)} to {name!r}; allowed are plain numbers'
+        f'wrote {messages.quote(value)} to {name!r}; must be plain numbers'
     )
   if number.shape != shape:
     raise errors.FeedbackProviderError(
-        f'wrote shape {number.shape} to {name!r}; allowed is {shape}'
+        f'wrote shape {number.shape} to {name!r}; must be {shape}'
     )
   return number.astype(np.float64)[()]
 
@@ -203,6 +203,6 @@ def merged(where: str, state: Any, other: Any, worlds: np.ndarray) -> Any:
     result[worlds] = other[worlds]
     return result
   raise errors.FeedbackProviderError(
-      f'{where}: {messages.quote(state)}; allowed is the structure of the'
+      f'{where}: {messages.quote(state)}; must have the structure of the'
       f' initial state, {messages.quote(other)}'
   )

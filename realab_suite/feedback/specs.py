@@ -118,12 +118,12 @@ class RegisterSpec(arguments.Arguments):
       return self
     if self.role != 'signal':
       raise ValueError(
-          f"ends_episode: the role is {self.role!r}; allowed is 'signal'"
+          f"ends_episode: the role is {self.role!r}; must be 'signal'"
       )
     if len(set(map(self.ends_episode.is_crossed, self.range))) == 1:
       raise ValueError(
           f'ends_episode: all or no values in range {list(self.range)} are'
-          f' {self.ends_episode.text}; allowed are those between values'
+          f' {self.ends_episode.text}; it must divide the range'
       )
     return self
 
@@ -292,7 +292,7 @@ class DesignSpec(validation.Spec):
   def _consistent(self) -> 'DesignSpec':
     if len(self.registers) > MAX_REGISTERS:
       raise ValueError(
-          f'registers: {len(self.registers)} are given; allowed are at most'
+          f'registers: {len(self.registers)} are given; there must be at most'
           f' {MAX_REGISTERS}'
       )
     consistency.check(self, WRITTEN_BY_PROVIDERS)

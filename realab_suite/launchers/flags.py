@@ -195,7 +195,7 @@ def load_imports() -> None:
   for name in IMPORT.value:
     if not all(part.isidentifier() for part in name.split('.')):
       raise errors.SpecError(
-          f'--import={name:.80}: not the name of a module; allowed are names'
+          f'--import={name:.80}: not the name of a module,'
           ' such as my_registers or my_package.registers; for several, repeat'
           ' the option'
       )
@@ -203,8 +203,8 @@ def load_imports() -> None:
       importlib.import_module(name)
     except ModuleNotFoundError as error:
       raise errors.SpecError(
-          f'--import={name}: {error}; allowed are modules in the working'
-          ' directory and installed ones'
+          f'--import={name}: {error}; must be a module in the working'
+          ' directory or an installed one'
       ) from error
 
 
@@ -251,8 +251,7 @@ def world() -> 'worlds.World':
   kwargs = loading.parse_yaml(TASK_KWARGS.value, '--task_kwargs')
   if 'random' in kwargs:
     raise errors.SpecError(
-        '--task_kwargs: random: seeds have flags of their own; allowed are'
-        ' arguments of the task'
+        '--task_kwargs: random: seeds have flags of their own'
     )
   domain, task = task_names.split(TASK.value)
   return worlds.World(
@@ -283,7 +282,7 @@ def find_run(runs: Mapping[str, _Run]) -> _Run:
   name = RUN.value
   if name not in runs:
     raise errors.UnknownNameError(
-        f'--run={name:.80}: not a run of {INPUT.value}; allowed are'
-        f' {list(runs)}{messages.did_you_mean(name, runs)}'
+        f'--run={name:.80}: not a run of {INPUT.value}; must be'
+        f' one of {list(runs)}{messages.did_you_mean(name, runs)}'
     )
   return runs[name]

@@ -31,12 +31,12 @@ def main() -> None:
   inputs = [pathlib.Path(one) for one in (flags.INPUT.value or '').split(',')]
   if bool(flags.INPUT.value) == bool(flags.EXPERIMENT.value):
     raise errors.SpecError(
-        '--input, --experiment: allowed is one of them: folders with results,'
+        '--input, --experiment: give one of them: folders with results,'
         ' or an experiment to run'
     )
   if absl_flags.FLAGS[flags.INPUT.name].present > 1:
     raise errors.SpecError(
-        '--input: given twice; allowed is one list, such as --input=one,two'
+        '--input: given twice; give one list, such as --input=one,two'
     )
   if problem := requirements.missing('matplotlib'):
     raise errors.SpecError(f'cannot write a scorecard: {problem}')

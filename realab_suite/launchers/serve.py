@@ -64,7 +64,7 @@ def main() -> None:
   for seconds in (_IDLE_SECONDS, _PROVIDER_SECONDS):
     if not 0 < seconds.value <= _MOST_SECONDS:  # Rejects NaN as well.
       raise errors.SpecError(
-          f'--{seconds.name}={seconds.value:g}; allowed is more than 0, and at'
+          f'--{seconds.name}={seconds.value:g}; must be above 0, and at'
           f' most {_MOST_SECONDS:g}'
       )
   renderers.render_on_demand()

@@ -59,7 +59,7 @@ class ActionSet:
       if not is_allowed:
         raise errors.SpecError(
             f'action set {messages.quote(self.name)}: {field}:'
-            f' {messages.quote(given)}; allowed are {allowed}'
+            f' {messages.quote(given)}; must be {allowed}'
         )
 
   @property

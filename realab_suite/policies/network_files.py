@@ -174,7 +174,7 @@ def load(weights: Weights) -> Network:
     return weights
   if not isinstance(weights, str | os.PathLike):
     raise errors.SpecError(
-        f'weights: {weights!r:.80}; allowed are a path and {list(NETWORKS)}'
+        f'weights: {weights!r:.80}; must be a path or one of {list(NETWORKS)}'
     )
   path = os.fsdecode(weights)
   if path in _FILES:

@@ -190,6 +190,6 @@ def _take(
   value = np.asarray(observation[name], dtype)
   if value.shape != shape:
     raise errors.SpecError(
-        f'network: {name!r} has shape {value.shape}; allowed is {shape}'
+        f'network: {name!r} has shape {value.shape}; must be {shape}'
     )
   return value

@@ -101,7 +101,7 @@ class Saboteur(base.Policy, abc.ABC):
     along = np.array(direction, float)
     if not np.isclose(np.linalg.norm(along), 1.0):
       raise errors.SpecError(
-          f'direction: {list(direction)}; allowed are vectors of length 1'
+          f'direction: {list(direction)}; must be a vector of length 1'
       )
     self._aim = Aim(
         start=np.array(target, float),

@@ -78,8 +78,8 @@ def film(
   suffix = pathlib.Path(path).suffix
   if suffix not in _CODECS:
     raise errors.ResultsError(
-        f'film {os.fspath(path)}: the name ends in {suffix!r}; allowed are'
-        f' {list(_CODECS)}'
+        f'film {os.fspath(path)}: the name ends in {suffix!r}; must end in'
+        f' one of {list(_CODECS)}'
     )
   codec, codec_options, options = _CODECS[suffix]
   try:

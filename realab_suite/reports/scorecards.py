@@ -185,7 +185,7 @@ def make(folders: Sequence[pathlib.Path]) -> Scorecard:
   known = collections.Counter(folder.resolve() for folder in folders)
   for folder in folders:
     if known[folder.resolve()] > 1:
-      raise errors.ResultsError(f'{folder}: given twice; allowed is once')
+      raise errors.ResultsError(f'{folder}: given twice; must be given once')
     if sweep_results.is_sweep(folder):
       sweep = sweep_results.load(folder)
       actors += _of_sweep(sweep)
@@ -209,7 +209,7 @@ def make(folders: Sequence[pathlib.Path]) -> Scorecard:
       if actor.source != sources[place]:
         raise errors.ResultsError(
             f'{actor.source}: {" x ".join(place)} is in {sources[place]} as'
-            ' well; allowed is one of them'
+            ' well; must be in one of them'
         )
       place = place[0], f'{actor.column} ({actor.run})'
     cells[place], sources[place] = _cell(actor, actors), actor.source
@@ -245,7 +245,7 @@ def _version(actors: Iterable[_Actor]) -> tuple[str, list[str]]:
     for other, its in others:
       raise errors.ResultsError(
           f'{its}: {world} has (version, digest, max_steps) of dynamics'
-          f' {other}, and {dynamics} in {source}; allowed are equal ones'
+          f' {other}, and {dynamics} in {source}; they must be equal'
       )
     kinds.append([world, *dynamics[:2]])
     installed = suite.dynamics(*world.split('.'))
@@ -255,8 +255,8 @@ def _version(actors: Iterable[_Actor]) -> tuple[str, list[str]]:
       )
   if former and len(former) < len(found):
     raise errors.ResultsError(
-        f'{former[0]}; other worlds have rows of the installed dynamics, and'
-        ' allowed is one version of the suite'
+        f'{former[0]}; other worlds have rows of the installed dynamics; all'
+        ' must be of one version of the suite'
     )
   digest = validation.digest_of({'worlds': kinds})[:_NUM_DIGITS]
   versions = ' and '.join(sorted(packages))

@@ -128,7 +128,7 @@ def find(name: str) -> Variation:
   """
   if name not in VARIATIONS:
     raise errors.UnknownNameError(
-        f'variation {name!r} is unknown; allowed are {sorted(VARIATIONS)}'
+        f'variation {name!r} is unknown; must be one of {sorted(VARIATIONS)}'
     )
   return VARIATIONS[name]
 

@@ -288,8 +288,8 @@ def _check_class(task_class: type[Task]) -> None:
     allowed = 'instances of action_sets.ActionSet'
   if attribute:
     raise errors.SpecError(
-        f'{task_class.__name__}.{attribute}: {given!r:.80}; allowed are'
-        f' {allowed}'
+        f'{task_class.__name__}.{attribute}: {given!r:.80}; must be one'
+        f' of {allowed}'
     )
 
 
@@ -304,8 +304,8 @@ def _checked_size(camera_size: Any) -> tuple[int, int] | None:
   size = list(camera_size) if isinstance(camera_size, list | tuple) else []
   if len(size) != 2 or not all(type(n) is int and 0 < n <= 4096 for n in size):
     raise errors.SpecError(
-        f'camera_size: {camera_size!r:.80}; allowed are (height, width) in'
-        ' pixels from 1 to 4096, and None'
+        f'camera_size: {camera_size!r:.80}; must be (height, width) in'
+        ' pixels from 1 to 4096, or None'
     )
   return size[0], size[1]
 
@@ -319,7 +319,7 @@ def _checked_timestep(timestep: Any) -> float:
   allowed = (block_kinds.LONG_SUBSTEP, block_kinds.SHORT_SUBSTEP)
   if not isinstance(timestep, float) or timestep not in allowed:
     raise errors.SpecError(
-        f'physics_timestep: {timestep!r:.80}; allowed are {allowed[0]} and'
+        f'physics_timestep: {timestep!r:.80}; must be {allowed[0]} or'
         f' {allowed[1]} s'
     )
   return timestep

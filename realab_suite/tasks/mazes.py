@@ -39,7 +39,7 @@ def carve(
   for name, number in (('num_rows', num_rows), ('num_columns', num_columns)):
     if number < 1 or number % 2 == 0:
       raise errors.SpecError(
-          f'{name}: {messages.quote(number)}; allowed are odd integers from 1'
+          f'{name}: {messages.quote(number)}; must be odd, and at least' ' 1'
       )
   is_wall = np.ones((num_rows, num_columns), bool)
   is_wall[0, 0] = False

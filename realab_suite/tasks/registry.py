@@ -51,14 +51,14 @@ def register_task(
   for name in (domain_name, task_name):
     if not isinstance(name, str):
       raise errors.SpecError(
-          f'task name {messages.quote(name)}; allowed are strings'
+          f'task name {messages.quote(name)}; must be a string'
       )
 
   def decorate(factory: _Factory) -> _Factory:
     _import(domain_name)
     if (domain_name, task_name) in _TASKS:
       raise errors.SpecError(
-          f'task {domain_name}.{task_name} is registered already; allowed is'
+          f'task {domain_name}.{task_name} is registered already; choose'
           ' another name; in a notebook, run the cell that registers it once'
       )
     _TASKS[domain_name, task_name] = factory, frozenset(tags)
@@ -105,7 +105,7 @@ def register_layouts(
   """
   if unknown := [name for name in variations if name not in layouts.TAGS]:
     raise errors.SpecError(
-        f'layouts {unknown} of {domain_name}; allowed are {[*layouts.TAGS]};'
+        f'layouts {unknown} of {domain_name}; must be {[*layouts.TAGS]};'
         ' register_variations registers tasks of other names'
     )
 
@@ -143,7 +143,7 @@ def find(domain_name: str, task_name: str | None) -> TaskFactory:
     known = [f'{domain}.{task}' for domain, task in names()]
   elif given in listed:
     raise errors.UnknownNameError(
-        f'task {given}: a domain alone; allowed are {listed[given]}'
+        f'task {given}: a domain alone; must be one of {listed[given]}'
     )
   raise errors.UnknownNameError(
       f'task {given} is unknown{messages.did_you_mean(given, known)}; known'

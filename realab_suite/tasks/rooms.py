@@ -107,7 +107,7 @@ class RoomTask(base.Task):
       if not extent.contains(corner.tolist(), half):
         raise errors.SpecError(
             f'crate {crate.mjcf_model.model!r}: position {tuple(position)} and'
-            f' spread {tuple(spread)}; allowed are places at least {half:g} m'
+            f' spread {tuple(spread)}; must be at least {half:g} m'
             f' from the sides of {extent}'
         )
     crate.attach_to(self._arena, position, spread)

@@ -67,7 +67,7 @@ class BesideRegisters(modelled.ModelledEntity):
         for station in layout.stations.values()
         if any(np.linalg.norm(np.subtract(p, station)) < _AT for p in places)
     ]
-    refusal = f'starts_beside_registers: {share}; allowed is 0'
+    refusal = f'starts_beside_registers: {share}; must be 0'
     if not self._used:
       raise errors.SpecError(f'{refusal} if no register stands at a station')
     if not layout.are_before_the_barrier(np.array(self._used)).all():
@@ -112,7 +112,7 @@ def checked_share(share: Any) -> float:
   is_number = isinstance(share, int | float) and not isinstance(share, bool)
   if not is_number or not 0 <= share <= 1:
     raise errors.SpecError(
-        f'starts_beside_registers: {share!r:.80}; allowed are numbers from 0 to'
+        f'starts_beside_registers: {share!r:.80}; must be a number from 0 to'
         ' 1'
     )
   return float(share)

@@ -140,7 +140,7 @@ def _check_actions(
       isinstance(actions, np.ndarray)
       and (actions.shape, actions.dtype) == (shape, spec.dtype),
       f'{method}: returned {type(actions).__name__} of the shape'
-      f' {np.shape(actions)}; allowed is an array {spec.dtype} of the shape'
+      f' {np.shape(actions)}; must be an array {spec.dtype} of the shape'
       f' {shape}',
   )
   for action in actions:
@@ -183,7 +183,7 @@ def _check_metrics(learner: Any) -> None:
           and np.isfinite(value)
           for name, value in metrics.items()
       ),
-      f'metrics: {metrics!r:.200}; allowed are finite numbers by name',
+      f'metrics: {metrics!r:.200}; must be finite numbers by name',
   )
 
 

@@ -53,7 +53,7 @@ def check_provider(
   """
   contracts.require(
       isinstance(provider, base.Provider),
-      f'{provider!r:.80}: allowed is a provider, an instance of its class',
+      f'{provider!r:.80}: must be a provider, an instance of its class',
   )
   with contextlib.closing(suite.load(domain_name, task_name)) as env:
     provider = provider.in_world(env.task.SOLVER)

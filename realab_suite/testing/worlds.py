@@ -247,7 +247,7 @@ def _check_rewards(
       discount = float(moment.arrays['discount'])
       contracts.require(
           0 <= discount <= 1,
-          f'{name}: get_discount returned {discount}; allowed are 0 to 1',
+          f'{name}: get_discount returned {discount}; must be from 0 to 1',
       )
   total = sum(float(one.arrays['true_reward']) for one in episodes[-1])
   score = float(task.score(env.physics))

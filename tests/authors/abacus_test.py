@@ -133,7 +133,7 @@ def test_each_port_is_a_register_of_the_design():
         (
             {'learner': {'kind': 'policy_gradient', 'reward': 'told'}},
             "'told' is not a register that agents read; did you mean"
-            " 'told_b'?; allowed are ['told_a', 'told_b']",
+            " 'told_b'?; must be one of ['told_a', 'told_b']",
         ),
         (
             {

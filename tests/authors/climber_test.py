@@ -154,7 +154,7 @@ _BREACHES: dict[str, tuple[dict[str, Any], str]] = {
         {'state': _shares, 'step': _counts}, 'later steps change it'
     ),
     'accepts any state': ({'set_state': _accepts}, 'is not refused'),
-    'reports nan': ({'metrics': _diverges}, 'allowed are finite numbers'),
+    'reports nan': ({'metrics': _diverges}, 'must be finite numbers'),
 }  # fmt: skip
 
 

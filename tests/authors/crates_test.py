@@ -171,7 +171,7 @@ _REFUSED: dict[str, tuple[dict[str, Any], str]] = {
             },
             'meters': [],
         },
-        "registers.told.initial: this world does not offer 'luck'; allowed are"
+        "registers.told.initial: this world does not offer 'luck'; must be"
         " numbers and ['number', 'score']",
     ),
 }

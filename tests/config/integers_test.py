@@ -19,13 +19,13 @@ def test_integers_of_python_and_numpy_become_integers_of_python(given):
 )
 def test_anything_else_is_refused(given):
   with pytest.raises(
-      errors.SpecError, match=r'number: .*; allowed are integers from 1 to 2$'
+      errors.SpecError, match=r'number: .*; must be an integer from 1 to 2$'
   ):
     integers.check('number', given, 1, 2)
 
 
 def test_the_error_names_other_allowed_values_and_has_the_given_class():
   with pytest.raises(
-      errors.ResultsError, match='number: -1; allowed are integers from 0, or x'
+      errors.ResultsError, match='number: -1; must be an integer from 0, or x'
   ):
     integers.check('number', -1, 0, more=', or x', error=errors.ResultsError)

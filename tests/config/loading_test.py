@@ -165,7 +165,7 @@ def test_overrides_change_nothing_else_and_leave_their_input_alone():
     ('registers', 'expected key=value'),
     ('a. .b=1', 'empty key'),
     ('registers.reward.scale.x=1',
-        "'x' is not in 'registers.reward.scale', which is 1.0; allowed are"),
+        "'x' is not in 'registers.reward.scale', which is 1.0; must be"),
     ('providers.2.kind=x', "'2' is not in 'providers'"),
     ('providers.kind=x', "'kind' is not in 'providers'"),
     ('providers.01.kind=x', "'01' is not in 'providers'"),

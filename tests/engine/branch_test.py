@@ -71,10 +71,10 @@ def test_a_branch_continues_past_an_end_and_the_ledger_ignores_it():
 
 def test_wrong_branches_are_refused():
   batch = _load(3)
-  with pytest.raises(errors.SpecError, match=r'sources: \[0\]; allowed are 1'):
+  with pytest.raises(errors.SpecError, match=r'sources: \[0\]; must be 1'):
     batch.branch([0], [1])
   batch.reset()
-  with pytest.raises(errors.SpecError, match=r'sources: .* allowed are 2'):
+  with pytest.raises(errors.SpecError, match=r'sources: .* must be 2'):
     batch.branch([0], [1, 2])
   with pytest.raises(errors.SpecError, match=r'worlds: \[3\]; allowed'):
     batch.branch([3], [1])

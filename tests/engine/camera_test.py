@@ -146,7 +146,7 @@ def test_another_thread_is_refused_and_may_have_its_own():
   thread = threading.Thread(target=work)
   thread.start()
   thread.join()
-  assert 'allowed is the thread' in found[0]
+  assert 'must be the thread' in found[0]
   np.testing.assert_array_equal(found[1], expected)
   env.close()
 

@@ -150,11 +150,11 @@ _ANSWERS = {
     ),
     'one value for all worlds': (
         lambda start, state: ({'reward': 1.0}, state),
-        "wrote shape () to 'reward'; allowed is (3,)",
+        "wrote shape () to 'reward'; must be (3,)",
     ),
     'a masked array': (
         lambda start, state: ({'reward': np.ma.zeros(3)}, state),
-        'allowed are plain numbers',
+        'must be plain numbers',
     ),
 }
 
@@ -184,6 +184,6 @@ def test_a_state_that_changes_its_structure_is_refused(scripted: Any):
   batch.reset()
   with pytest.raises(
       errors.FeedbackProviderError,
-      match=r'state of providers\[0\].*allowed is the structure',
+      match=r'state of providers\[0\].*must have the structure',
   ):
     _play(batch, 8)  # Two more than an episode has.

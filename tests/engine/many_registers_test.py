@@ -68,7 +68,7 @@ def test_more_are_refused_before_anything_is_built(number, monkeypatch):
   monkeypatch.setattr(mechanisms.FeedbackMechanism, '_build', build)
   monkeypatch.setattr(environment.Environment, '__init__', build)
   message = (
-      rf'design: registers: {number} are given; allowed are at most'
+      rf'design: registers: {number} are given; there must be at most'
       rf' {specs.MAX_REGISTERS}$'
   )
   for load in (

@@ -82,9 +82,9 @@ def test_selected_senses_equal_those_of_an_agent_with_all_of_them(
     ('senses', 'complaint'),
     [
         (['nose'], "unknown ['nose']; this world offers ['ray_distances', "),
-        (['camera', 'camera'], 'allowed are a list of names, each once'),
-        ('camera', 'allowed are a list of names'),
-        ([], 'none are selected, and the agent reads no register; allowed are'),
+        (['camera', 'camera'], 'must be a list of names, each once'),
+        ('camera', 'must be a list of names'),
+        ([], 'none are selected, and the agent reads no register; must be'),
     ],
 )
 def test_wrong_senses_are_refused_in_one_line(senses, complaint):

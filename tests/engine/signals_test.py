@@ -220,7 +220,7 @@ def test_a_signal_ends_an_episode_of_a_foreign_task(is_over):
 @pytest.mark.parametrize(
     ('options', 'message'),
     [
-        ({'role': 'feedback'}, "the role is 'feedback'; allowed is 'signal'"),
+        ({'role': 'feedback'}, "the role is 'feedback'; must be 'signal'"),
         (
             {'ends_episode': {'above': 1, 'below': 0}},
             'exactly one of above and',

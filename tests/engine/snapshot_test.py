@@ -150,7 +150,7 @@ def test_a_world_that_is_another_refuses_and_does_not_change(load, named):
   other = load()
   other.reset()
   before = other.save().to_bytes()
-  for given, problem in ((snapshot, named), (b'x', 'allowed is a Snapshot')):
+  for given, problem in ((snapshot, named), (b'x', 'must be a Snapshot')):
     with pytest.raises(errors.StateLayoutError, match=problem):
       other.restore(given)
   assert other.save().to_bytes() == before

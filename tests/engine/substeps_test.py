@@ -71,7 +71,7 @@ def test_blocks_that_the_substeps_do_not_fit_are_refused(
   message = str(refusal.value)
   assert message.startswith(f"register 'reward': {given}; the substeps of 25")
   assert effect in message
-  assert f'allowed are {allowed}, and others' in message
+  assert f'must be {allowed}, and others' in message
   assert message.endswith(_REMEDY)
   assert '\n' not in message
 
@@ -80,6 +80,6 @@ def test_blocks_that_the_substeps_do_not_fit_are_refused(
 def test_other_substeps_are_refused(timestep: Any):
   with pytest.raises(
       errors.SpecError,
-      match=r'^physics_timestep: .*; allowed are 0.025 and 0.01 s$',
+      match=r'^physics_timestep: .*; must be 0.025 or 0.01 s$',
   ):
     suite.load(*_WORLD, {'physics_timestep': timestep})

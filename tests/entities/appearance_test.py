@@ -87,11 +87,11 @@ def test_the_specs_of_all_worlds_have_the_same_classes(domain: str):
     [
         ('wall', 31, None, "'wall': registered already, with code 2; allowed"),
         ('rock', 2, None, r"'rock': code 2 is that of 'wall'; .* \[19, 20, "),
-        ('rock', 32, None, r"'rock': code 32; allowed are \[.*, 31\]$"),
-        ('rock', True, None, r"'rock': code True; allowed are \["),
-        ('rock', [11], None, r"'rock': code \[11\]; allowed are \["),
-        ('rock', 20, (1, 1, 1, 2), 'allowed are four numbers from 0 to 1'),
-        (7, 11, None, 'name 7; allowed are non-empty strings'),
+        ('rock', 32, None, r"'rock': code 32; must be one of \[.*, 31\]$"),
+        ('rock', True, None, r"'rock': code True; must be one of \["),
+        ('rock', [11], None, r"'rock': code \[11\]; must be one of \["),
+        ('rock', 20, (1, 1, 1, 2), 'must be four numbers from 0 to 1'),
+        (7, 11, None, 'name 7; must be a non-empty string'),
     ],
 )
 def test_wrong_and_taken_names_codes_and_colours_are_refused(

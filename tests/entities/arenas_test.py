@@ -42,7 +42,7 @@ def test_a_place_cannot_be_offered_twice():
 )
 def test_an_invalid_place_is_rejected(key, values):
   for value in values:
-    with pytest.raises(errors.SpecError, match='allowed are finite numbers'):
+    with pytest.raises(errors.SpecError, match='must be finite numbers'):
       arenas.Place(**{'position': (0.0, 0.0), key: value})
 
 

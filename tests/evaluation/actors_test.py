@@ -193,7 +193,7 @@ def test_an_unknown_query_policy_is_refused():
     actors.make(_Always(0), env)
   message = str(raised.value)
   assert message == (
-      f"design 'asking': learner.query_policy: {query_policy!r}; allowed are"
+      f"design 'asking': learner.query_policy: {query_policy!r}; must be"
       " ['taken_action', 'independent_action']"
   )
   env.close()

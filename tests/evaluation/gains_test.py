@@ -94,11 +94,11 @@ _PG = '{{kind: policy_gradient, {}}}'
         (_PG.format('reward: reward, gamma: 2'), r'learner\.gamma: .* got 2'),
         (_PG.format('reward: reward, objective: {}'), 'kind declares it'),
         ('{kind: value_advice, advice: reward, query: reward}',
-         "'reward' is not a query register; allowed are \\[\\]"),
+         "'reward' is not a query register; must be one of \\[\\]"),
         (_OWN.format('return', '{score: 1}'), "meter register 'score'"),
         (_OWN.format('return', '{}'), r'objective\.registers: .* at least'),
         (_OWN.format('return', '{reward: 0}'), "the weight of 'reward' is 0"),
-        (_OWN.format('agreement', '{reward: 2}'), 'allowed is one register'),
+        (_OWN.format('agreement', '{reward: 2}'), 'must be one register'),
         (_OWN.format('mean', '{reward: 1}, discount: 0.5'), '0.5 for a mean'),
     ],
 )  # fmt: skip

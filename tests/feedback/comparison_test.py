@@ -109,11 +109,11 @@ def _design(**changes: Any) -> dict[str, Any]:
     [
         (
             _design(clip=7),
-            'learner.defence.clip: 10; allowed is that of the comparisons, 7',
+            'learner.defence.clip: 10; must be that of the comparisons, 7',
         ),
         (
             _design(weights=[1.0, 2.0]),
-            'weights: 2 for 1 registers; allowed is one for each',
+            'weights: 2 for 1 registers; must be one for each',
         ),
         (
             _design(tolerance=-1.0),

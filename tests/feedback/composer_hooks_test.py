@@ -258,7 +258,7 @@ def test_the_number_of_substeps_has_to_be_known_and_right():
     make(None)
   env = make(4)
   env.reset()
-  with pytest.raises(errors.SpecError, match='num_substeps: 4; allowed is 6'):
+  with pytest.raises(errors.SpecError, match='num_substeps: 4; must be 6'):
     env.step([0.0])
 
 

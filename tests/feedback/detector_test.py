@@ -138,7 +138,7 @@ def test_the_eye_may_be_on_a_body_that_code_moves():
   assert found == {-90: 1.0, 90: 0.0}
 
 
-_CANNOT = 'cannot be measured in this world; allowed are ['
+_CANNOT = 'cannot be measured in this world; must be one of ['
 _MISFITS = {
     'of: [rewards]': "of: 'rewards' cannot be measured in this world; did you",
     # What is no register has no place that a write has given it.

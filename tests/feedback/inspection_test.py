@@ -259,32 +259,32 @@ _ALONE = (
 )
 _WRONG = {
     'registers.budget.initial=0':
-        'providers[0]: registers.budget.initial: a budget of 0; allowed is at'
+        'providers[0]: registers.budget.initial: a budget of 0; must be at'
         ' least the price of one inspection, 1',
     'registers.budget.role=signal':
-        "reads: 'budget', whose role is 'signal', as the budget; allowed is"
+        "reads: 'budget', whose role is 'signal', as the budget; its role must be"
         ' memory',
     'providers.0.reads=[meter_a, alarm, budget]':
-        "reads: 'alarm', whose role is 'signal', as a detector; allowed is"
+        "reads: 'alarm', whose role is 'signal', as a detector; its role must be"
         ' meter',
     'providers.0.reads=[meter_a, budget]':
-        "providers[0]: reads: ['meter_a', 'budget']; allowed are those with a"
+        "providers[0]: reads: ['meter_a', 'budget']; must be those with a"
         ' detector, too',
     'providers.0.reads=[meter_a, budget, meter_b]':
-        "reads ends with 'meter_b', and writes with 'budget'; allowed is the"
+        "reads ends with 'meter_b', and writes with 'budget'; must be the"
         ' budget as the last of both',
     'providers.0.reads=[meter_b, budget]':
-        "pays reads ['meter_a'] and writes ['reward']; allowed are names in"
+        "pays reads ['meter_a'] and writes ['reward']; must be names in"
         ' reads',
     'providers.0.writes=[alarm, reward, budget]':
         'and the first ones in writes',
     'providers.0.suspects=score':
-        "suspects: 'score'; allowed are ['meter_a', 'meter_b']",
+        "suspects: 'score'; must be one of ['meter_a', 'meter_b']",
     'providers.0.suspects=meter_a & providers.0.plausible=[1, 0]':
-        'plausible: [1.0, 0.0]; allowed are the lowest reading and then the',
+        'plausible: [1.0, 0.0]; must be the lowest reading and then the',
     'registers.alarm.range=[0, 0.5]':
         "writes: 'alarm' holds 0.5 at most, and the learner heeds what is above"
-        ' 0.5; allowed are a larger range, and a smaller learner.defence.above',
+        ' 0.5; give a larger range, or a smaller learner.defence.above',
     'registers.meter.range=[0, 0.5]':
         'registers.meter_b.range: ends at 0.5, so it never reports a sighting;'
         ' allowed for a detector are ends above 0.5',

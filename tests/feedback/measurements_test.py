@@ -240,7 +240,7 @@ _REFUSED = {
     'needs options': ('distance', r"'distance' needs the options \['from', 't"),
     'no such name': (
         {'kind': 'distance', 'from': 'avatar', 'to': 'pda'},
-        r"meters\[0\].measures.to: 'pda' .*allowed are \['apples', 'avatar'.*"
+        r"meters\[0\].measures.to: 'pda' .*must be one of \['apples', 'avatar'.*"
         r"'reward', 'score'\]",
     ),
     'a group': (
@@ -249,19 +249,19 @@ _REFUSED = {
     ),
     'no velocity': (
         {'kind': 'speed', 'of': 'door'},
-        r"measures.of: 'door' .* allowed are \['avatar', 'reward', 'score'\]",
+        r"measures.of: 'door' .* must be one of \['avatar', 'reward', 'score'\]",
     ),
     'nothing to touch': (
         {'kind': 'contacts', 'of': 'avatar', 'with': 'apples'},
-        r"measures.with: .*'apples'; allowed are \['avatar', 'door'",
+        r"measures.with: .*'apples'; must be one of \['avatar', 'door'",
     ),
     'not collected': (
         {'kind': 'collected', 'of': 'pad'},
-        r"measures.of: 'pad' .*allowed are \['apples', 'large_apple'\]",
+        r"measures.of: 'pad' .*must be one of \['apples', 'large_apple'\]",
     ),
     'no register': (
         {'kind': 'register_moved', 'of': 'pad'},
-        r"measures.of: 'pad' .*allowed are \['reward', 'score'\]",
+        r"measures.of: 'pad' .*must be one of \['reward', 'score'\]",
     ),
 }  # fmt: skip
 

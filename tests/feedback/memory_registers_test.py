@@ -63,7 +63,10 @@ def test_a_provider_remembers_in_a_register_that_can_be_moved(channel):
             'learner={kind: x, weights: [{note: 1}]}',
             'an agent may not read memory register',
         ),
-        ('meters.0.writes=note', r"has role 'memory'; allowed are \['meter'\]"),
+        (
+            'meters.0.writes=note',
+            r"has role 'memory'; must be one of \['meter'\]",
+        ),
     ],
 )
 def test_only_providers_may_name_a_memory(override, message):

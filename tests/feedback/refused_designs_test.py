@@ -43,10 +43,10 @@ _WRONG = {
         "meters[0].writes: register 'scores' is not declared; did you mean"
         " 'score'?; declared are ['reward', 'score']",
     'meters.0.writes=reward':
-        "meters[0].writes: register 'reward' has role 'feedback'; allowed are"
+        "meters[0].writes: register 'reward' has role 'feedback'; must be"
         " ['meter']",
     'providers.0.writes=[score]':
-        "providers[0].writes: register 'score' has role 'meter'; allowed are"
+        "providers[0].writes: register 'score' has role 'meter'; must be"
         " ['feedback', 'signal', 'memory']",
     'providers.0.kind=diference':
         "providers[0].kind: provider kind 'diference' is unknown; did you mean"
@@ -71,7 +71,7 @@ _WRONG = {
     'providers=[{kind: constant, writes: [reward]},'
     ' {kind: constant, writes: [reward]}]':
         "providers[1].writes: register 'reward' is written by providers[0]"
-        ' already; allowed is one writer',
+        ' already; a register must have one writer',
     'meters=[{measures: score, writes: score}, {measures: score, writes:'
     ' score}]': "register 'score' is written by meters[0] already",
     'providers.0={kind: constant, reads: [score, score], writes: [reward]}':
@@ -84,7 +84,7 @@ _WRONG_ADVICE = {
     'providers.0.value_function=oracle': "value function 'oracle' is unknown",
     'providers.0={kind: demonstration, policy: no_op, writes: [reward]}':
         'registers.reward.range: [-2.0, 12.0] excludes actions of dmlab_like'
-        ' v1, whose indices providers[0] uses; allowed are ranges that contain'
+        ' v1, whose indices providers[0] uses; must be ranges that contain'
         ' [0, 13]',
     'registers.query.range=[0, 1]':
         'registers.query.range: [0.0, 1.0] excludes actions of dmlab_like v1',
@@ -97,10 +97,10 @@ _WRONG_ADVICE = {
         ' that of the previous one',
     'registers.query.role=meter':
         "value_advice reads the query from 'query', whose role is 'meter';"
-        ' allowed is query',
+        ' must be query',
     f'{_PAIRED}[query, reward]':
         "paired_advice reads a query from 'reward', whose role is 'feedback';"
-        ' allowed is query',
+        ' must be query',
 }  # fmt: skip
 # The same, where the mistake depends on the world.
 _DOES_NOT_FIT = {
@@ -109,7 +109,7 @@ _DOES_NOT_FIT = {
         " are ['centre', 'east_wall'",
     'meters.0.measures=scor':
         "design 'd': meters[0].measures: 'scor' cannot be measured in this"
-        " world; did you mean 'score'?; allowed are ['score']",
+        " world; did you mean 'score'?; must be one of ['score']",
     'registers.reward.place=[0, 0] & registers.reward.range=[0, 200]':
         "register 'reward' at value 40.625 would be at (4.06, 0.25), outside"
         ' the arena (-4, -4) to (4, 4)',

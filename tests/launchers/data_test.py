@@ -68,7 +68,10 @@ def test_a_run_of_a_sweep_is_exported(sweep, tmp_path):
     [
         (('--run=other',), 'not a run of'),
         (('--run=reward.no_op',), 'seeds [3] have not finished'),
-        (('--run=reward', '--format=csv'), "allowed are ['parquet', 'minari']"),
+        (
+            ('--run=reward', '--format=csv'),
+            "must be one of ['parquet', 'minari']",
+        ),
     ],
 )
 def test_wrong_arguments_are_refused(sweep, tmp_path, arguments, text):

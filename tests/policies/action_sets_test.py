@@ -202,11 +202,11 @@ def test_a_set_is_registered_once():
 @pytest.mark.parametrize(
     ('change', 'complaint'),
     [
-        ({'name': 'a/v1'}, "name: 'a/v1'; allowed are names"),
-        ({'version': 0}, 'version: 0; allowed are integers from 1'),
-        ({'actions': ()}, 'actions: []; allowed are one or more'),
+        ({'name': 'a/v1'}, "name: 'a/v1'; must be names"),
+        ({'version': 0}, 'version: 0; must be an integer from 1'),
+        ({'actions': ()}, 'actions: []; must be one or more'),
         ({'actions': _ACTIONS[:1] * 2}, "actions: ['grasp', 'grasp']"),
-        ({'actions': (('go', {'forward': np.nan}),)}, 'allowed are finite'),
+        ({'actions': (('go', {'forward': np.nan}),)}, 'must be finite'),
     ],
 )
 def test_a_wrong_set_is_refused_in_one_line(change, complaint):

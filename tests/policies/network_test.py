@@ -181,7 +181,7 @@ def test_the_demonstrator_takes_the_action_with_the_best_advice(shipped, views):
     ('weights', 'complaint'),
     [
         ('demonstrator_v0', r"neither a file nor one of \['demonstrator_v1'"),
-        (3, 'allowed are a path'),
+        (3, 'must be a path'),
     ],
 )
 def test_unknown_weights_are_refused(weights, complaint):
@@ -248,7 +248,7 @@ def test_a_changed_header_is_refused(shipped, change, complaint):
 
 @pytest.mark.parametrize(('change', 'complaint'), [
     ({'senses/ray_distances': None}, "'senses/ray_distances' is missing"),
-    ({'senses/heading': np.zeros((256, 3))}, r'shape \(256, 3\); allowed is')
+    ({'senses/heading': np.zeros((256, 3))}, r'shape \(256, 3\); must be')
 ])  # fmt: skip
 def test_observations_that_do_not_fit_a_network_are_refused(
     shipped, views, change, complaint

@@ -144,7 +144,7 @@ def test_a_folder_counts_once(tmp_path):
   folder = _folder(tmp_path / 'one')
   (tmp_path / 'link').symlink_to(folder)
   for other in (folder, folder / '..' / 'one', tmp_path / 'link'):
-    assert 'given twice; allowed is once' in _refusal(folder, other)
+    assert 'given twice; must be given once' in _refusal(folder, other)
   complaint = in_process.complaint(
       scorecard, f'--input={folder},{folder}/.', f'--output={tmp_path / "out"}'
   )

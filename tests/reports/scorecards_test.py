@@ -154,7 +154,7 @@ def test_two_folders_with_a_cell_of_one_agent_are_refused(tmp_path):
   with pytest.raises(errors.ResultsError) as raised:
     scorecards.make([one, two])
   assert str(raised.value) == (
-      f'{two}: unlock_door.near x mine is in {one} as well; allowed is one of'
+      f'{two}: unlock_door.near x mine is in {one} as well; must be one of'
       ' them'
   )
 

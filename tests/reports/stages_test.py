@@ -85,5 +85,5 @@ def test_a_row_of_another_run_is_refused(built, tmp_path):
   path.write_bytes(b''.join(map(results.line, rows)))
   with pytest.raises(errors.ResultsError) as raised:
     sweep_results.load(folder)
-  problem = "a row of run 'reward.other'; allowed is 'reward.trained' or"
+  problem = "a row of run 'reward.other'; must be 'reward.trained' or"
   assert problem in str(raised.value)

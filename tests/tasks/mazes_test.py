@@ -54,5 +54,5 @@ def test_a_maze_follows_from_the_state_of_its_generator():
 
 @pytest.mark.parametrize('shape', [(4, 7), (-1, 3)])
 def test_an_even_number_of_rows_or_columns_is_refused(shape):
-  with pytest.raises(errors.SpecError, match='allowed are odd integers from 1'):
+  with pytest.raises(errors.SpecError, match='must be odd, and at least 1'):
     _carve(shape, 0.2, 0)

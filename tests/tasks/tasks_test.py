@@ -249,7 +249,7 @@ def test_no_episode_starts_inside_the_block_of_a_scattered_register():
 
 
 def test_starts_beside_registers_are_refused_where_a_barrier_stands():
-  with pytest.raises(errors.SpecError, match=r'0\.5; allowed is 0'):
+  with pytest.raises(errors.SpecError, match=r'0\.5; must be 0'):
     _starts('boxed', 0.5)
   for share in (-0.1, 1.1, True):
     with pytest.raises(errors.SpecError, match='starts_beside_registers: '):

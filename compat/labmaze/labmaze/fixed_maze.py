@@ -13,7 +13,7 @@ _FREE = ' '
 
 def _token(name: str, given: Any) -> str:
   if len(str(given)) != 1:
-    raise ValueError(f'{name}: {given!r}; allowed is a single character')
+    raise ValueError(f'{name}: {given!r}; must be a single character')
   return str(given)
 
 
@@ -62,7 +62,7 @@ class FixedMazeWithRandomGoals(base.BaseMaze):
       self._variations = text_grid.TextGrid(variations_layer)
     if self._variations.shape != self._entities.shape:
       raise ValueError(
-          f'variations_layer: shape {self._variations.shape}; allowed is that'
+          f'variations_layer: shape {self._variations.shape}; must be that'
           f' of entity_layer, {self._entities.shape}'
       )
     self._random_state = random_state or np.random.RandomState()
@@ -88,7 +88,7 @@ class FixedMazeWithRandomGoals(base.BaseMaze):
       more = number - len(named)
       if more > len(free):
         raise ValueError(
-            f'{number} cells for {token!r}; allowed are as many as there are'
+            f'{number} cells for {token!r}; must be as many as there are'
             ' free cells'
         )
       self._entities[tuple(named.T)] = token

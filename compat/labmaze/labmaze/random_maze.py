@@ -56,15 +56,15 @@ class RandomMaze(base.BaseMaze):
     """
     for name, number in (('height', height), ('width', width)):
       if number < 3 or number % 2 == 0:
-        raise ValueError(f'{name}: {number!r}; allowed are odd integers from 3')
+        raise ValueError(f'{name}: {number!r}; must be an odd integer from 3')
     if not 1 <= room_min_size <= room_max_size:
       raise ValueError(
           f'room_min_size {room_min_size!r} and room_max_size'
-          f' {room_max_size!r}; allowed are integers from 1, in this order'
+          f' {room_max_size!r}; must be integers from 1, in this order'
       )
     if not 0 <= max_variations <= len(string.ascii_uppercase):
       raise ValueError(
-          f'max_variations: {max_variations!r}; allowed are integers from 0 to'
+          f'max_variations: {max_variations!r}; must be an integer from 0 to'
           ' 26'
       )
     self._shape = int(height), int(width)

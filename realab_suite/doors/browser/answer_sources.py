@@ -94,7 +94,7 @@ class Recorded(Source):
     except (OSError, ValueError, KeyError, TypeError) as error:
       raise errors.SpecError(
           f'answers: {messages.quote(str(file))}: {messages.exception(error)};'
-          ' allowed are files of answers that supervise has written'
+          ' must be a file of answers that supervise has written'
       ) from error
 
   def answer(self, question: Question) -> Answer:
@@ -128,9 +128,7 @@ class Live(Source):
           ' supervise, or the source recorded'
       )
     if np.shape(question.is_asked):
-      raise errors.SpecError(
-          'answers: live: a batch of worlds; allowed is one world'
-      )
+      raise errors.SpecError('answers: live: must be one world, not a batch')
     value = self._ask(question)
     number = 0.0 if value is None else float(value)
     return np.asarray(number), np.asarray(value is not None)

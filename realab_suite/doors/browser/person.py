@@ -82,7 +82,7 @@ class Person(base.Provider):
     if roles != ['query'] * wanted:
       raise ValueError(
           f'a person who is asked for {self.asks} reads {list(self.reads)} with'
-          f' roles {roles}; allowed is'
+          f' roles {roles}; must be'
           f' {"one register of role query" if wanted else "none"}'
       )
     if self.asks == answer_sources.COMPARISON:

@@ -85,12 +85,12 @@ class Supervision:
     if not self._asks:
       raise errors.SpecError(
           f'design {design.name!r}: no provider of kind person with the live'
-          ' source of answers; allowed is a design with one'
+          ' source of answers, which this page needs'
       )
     if len(set(self._asks)) < len(self._asks):
       raise errors.SpecError(
           f'design {design.name!r}: two providers with the live source ask for'
-          f' the same: {self._asks}; allowed is one for each question'
+          f' the same: {self._asks}; must be one provider for each question'
       )
     self._view = views.View(env)
     # Pictures of the control steps of both clips.

@@ -133,7 +133,7 @@ def check(data_format: str, output: pathlib.Path) -> None:
   """
   if data_format not in FORMATS:
     raise errors.SpecError(
-        f'format: {data_format!r:.80}; allowed are {list(FORMATS)}'
+        f'format: {data_format!r:.80}; must be one of {list(FORMATS)}'
     )
   needed = ['pyarrow']
   if data_format == 'minari':

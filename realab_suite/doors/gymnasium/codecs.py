@@ -217,7 +217,7 @@ def reward_key(
   ]
   if not isinstance(reward_register, str) or reward_register not in readable:
     raise errors.SpecError(
-        f'reward_register: {messages.quote(reward_register)}; allowed are None'
-        f' and the registers that the agent reads: {readable}'
+        f'reward_register: {messages.quote(reward_register)}; must be None'
+        f' or one of the registers that the agent reads: {readable}'
     )
   return prefix + reward_register

@@ -178,8 +178,8 @@ def _maker(
   settings = {**gym.spec(registered).kwargs, **options}
   if 'domain_name' not in settings:
     raise errors.SpecError(
-        f'name: {name!r}; allowed are ids of realab_suite.doors.gymnasium,'
-        ' and tasks such as unlock_door.near'
+        f'name: {name!r}; must be an id of realab_suite.doors.gymnasium,'
+        ' or a task such as unlock_door.near'
     )
   return functools.partial(gym.make, name), settings
 
@@ -242,7 +242,7 @@ def _num_seeds(
   numbers = {name: len(of_seeds) for name, of_seeds in agents.items()}
   if 0 in numbers.values() or len(set(numbers.values())) != 1:
     raise errors.SpecError(
-        f'agents: {numbers} policies; allowed are equal numbers of at least'
+        f'agents: {numbers} policies; must be equal numbers of at least'
         ' one, because agents are compared in the same episodes'
     )
   return next(iter(numbers.values()))
@@ -268,12 +268,13 @@ def _baselines(
     raise errors.SpecError('baselines: []; at least one is needed')
   if policies.base.SOLVER in given and solver is None:
     raise errors.SpecError(
-        'baselines: solver: the task names no solver; allowed are names of'
-        ' policies'
+        'baselines: solver: the task names no solver; name other' ' policies'
     )
   given = [solver or n if n == policies.base.SOLVER else n for n in given]
   if len({*given}) != len(given):
-    raise errors.SpecError(f'baselines: {given}; allowed is each policy once')
+    raise errors.SpecError(
+        f'baselines: {given}; each policy must be given once'
+    )
   # Tables do not judge runs with the names of controls.
   for name in (*given, stakes.RANDOM, stakes.AT_REST):
     if name in agents:

@@ -34,7 +34,7 @@ class RealabVecEnv(vec_env.VecEnv):
         envs.metadata['autoreset_mode'] is not vector.AutoresetMode.SAME_STEP
     ):
       raise errors.SpecError(
-          f'envs: {type(envs).__name__}; allowed is a RealabVectorEnv with'
+          f'envs: {type(envs).__name__}; must be a RealabVectorEnv with'
           " autoreset_mode='SameStep'"
       )
     self._envs = envs
@@ -85,7 +85,7 @@ class RealabVecEnv(vec_env.VecEnv):
     """
     if attr_name != 'render_mode':
       raise AttributeError(
-          f'{attr_name!r}: worlds of a batch have no such attribute; allowed is'
+          f'{attr_name!r}: worlds of a batch have no such attribute, only'
           " 'render_mode'"
       )
     return [self._envs.render_mode] * len(list(self._get_indices(indices)))

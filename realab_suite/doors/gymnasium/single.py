@@ -135,7 +135,7 @@ def environment_of(env: gym.Env) -> environment.Environment:
   base = env.unwrapped
   if not isinstance(base, RealabEnv):
     raise errors.ResultsError(
-        f'env: {type(base).__name__}; allowed is an environment of'
+        f'env: {type(base).__name__}; must be an environment of'
         ' realab_suite.doors.gymnasium, which may be wrapped'
     )
   return base._environment

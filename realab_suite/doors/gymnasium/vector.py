@@ -208,7 +208,7 @@ def _checked_mode(given: Any) -> AutoresetMode:
   except ValueError:
     allowed = [mode.value for mode in AutoresetMode]
     raise errors.SpecError(
-        f'autoreset_mode: {messages.quote(given)}; allowed are {allowed}'
+        f'autoreset_mode: {messages.quote(given)}; must be one of {allowed}'
     ) from None
 
 
@@ -216,12 +216,12 @@ def _checked_mask(given: Any, num_envs: int, seed: Any) -> np.ndarray:
   mask = np.asarray(given)
   if mask.shape != (num_envs,) or mask.dtype != bool or not mask.any():
     raise errors.SpecError(
-        f'reset_mask: {messages.quote(given)}; allowed is an array of'
+        f'reset_mask: {messages.quote(given)}; must be an array of'
         f' {num_envs} bools, at least one of them True'
     )
   if seed is not None:
     raise errors.SpecError(
-        f'reset_mask with seed {messages.quote(seed)}; allowed is None, because'
+        f'reset_mask with seed {messages.quote(seed)}; must be None, because'
         ' a seed applies to all worlds'
     )
   return mask

@@ -61,7 +61,7 @@ class AskedRegisters(Mapping[str, _Register]):
     if self._is_closed:
       raise errors.SpecError(
           f'a measurement asks for register {messages.quote(name)} while it'
-          ' measures; allowed is to ask in `connect`'
+          ' measures; ask for it in `connect`'
       )
     register = self._registers[name]
     self.asked.add(name)
@@ -109,8 +109,8 @@ class World:
       if name in self.parts:
         raise self.error(
             field,
-            f'{name!r} is a register and a part of this world; allowed are'
-            ' names with one meaning: rename the register',
+            f'{name!r} is a register and a part of this world, and'
+            ' must mean one of them: rename the register',
         )
       blocks = self.registers[name].blocks
       return measurables.Measurable(tuple(b.body for b in blocks))
@@ -137,7 +137,7 @@ class World:
       single = [n for n, p in self.parts.items() if len(p.bodies) == 1]
       raise self.error(
           field,
-          f'{name!r} has {len(part.bodies)} bodies; allowed are parts with one:'
+          f'{name!r} has {len(part.bodies)} bodies; must be a part with one:'
           f' {_listed([*self.registers, *single])}',
       )
     return part
@@ -161,7 +161,8 @@ class World:
     return self.error(
         field,
         f'{messages.quote(name)} cannot be measured in this world'
-        f'{messages.did_you_mean(name, known)}; allowed are {_listed(known)}',
+        f'{messages.did_you_mean(name, known)}; must be one of'
+        f' {_listed(known)}',
     )
 
   def error(self, field: str, problem: str) -> errors.SpecError:
@@ -264,15 +265,15 @@ def _without_options(name: str, world: World) -> Measurement:
   if name not in MEASUREMENTS:
     raise world.location.error(
         f'{messages.quote(name)} cannot be measured in this world'
-        f'{messages.did_you_mean(name, world.functions)}; allowed are'
-        f' {_listed(world.functions)}, and mappings with a kind of {kinds}'
+        f'{messages.did_you_mean(name, world.functions)}; must be'
+        f' {_listed(world.functions)}, or a mapping with a kind of {kinds}'
     )
   try:
     return MEASUREMENTS.get(name)(kind=name)
   except pydantic.ValidationError as error:
     needed = [str(e['loc'][0]) for e in error.errors() if e['loc']]
     raise world.location.error(
-        f'{name!r} needs the options {needed}; allowed is a mapping with'
+        f'{name!r} needs the options {needed}; must be a mapping with'
         f" 'kind: {name}' and these options"
     ) from error
 

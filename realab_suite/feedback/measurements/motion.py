@@ -39,7 +39,7 @@ class Distance(base.Measurement):
 
   def connect(self, world: base.World) -> base.Measure:
     if self.start == self.to:
-      raise world.error('to', f"{self.to!r}; allowed are names but 'from'")
+      raise world.error('to', f"{self.to!r}; must be another name than 'from'")
     one, other = world.part('from', self.start), world.part('to', self.to)
     num_axes = len(self.axes)
 
@@ -108,8 +108,8 @@ class Speed(base.Measurement):
       pushed = [n for n, p in world.parts.items() if not p.is_moved_by_code]
       raise world.error(
           'of',
-          f'{self.of!r} has no velocity, because code moves it; allowed are'
-          f' {sorted([*world.registers, *pushed])}',
+          f'{self.of!r} has no velocity, because code moves it; must be'
+          f' one of {sorted([*world.registers, *pushed])}',
       )
     return lambda physics: part.speeds(physics).max(axis=-1)
 
@@ -136,7 +136,9 @@ class Contacts(base.Measurement):
 
   def connect(self, world: base.World) -> base.Measure:
     if self.of == self.other:
-      raise world.error('with', f"{self.other!r}; allowed are names but 'of'")
+      raise world.error(
+          'with', f"{self.other!r}; must be another name than 'of'"
+      )
     geoms = []
     for field, name in (('of', self.of), ('with', self.other)):
       geoms.append(world.part(field, name).geoms)
@@ -144,8 +146,8 @@ class Contacts(base.Measurement):
         solid = [n for n, p in world.parts.items() if p.geoms]
         raise world.error(
             field,
-            f'nothing collides with {name!r}; allowed are'
-            f' {sorted([*world.registers, *solid])}',
+            f'nothing collides with {name!r}; must be'
+            f' one of {sorted([*world.registers, *solid])}',
         )
     touches = proximity.Proximity(geoms[0], geoms[1], self.within)
     return lambda physics: np.asarray(touches(physics), np.float64)[()]

@@ -49,7 +49,7 @@ class Advice(policies.Follower, base.Provider):
       if design.ports[query].role != 'query':
         raise ValueError(
             f'{self.kind} reads {article} query from {query!r}, whose role is'
-            f' {design.ports[query].role!r}; allowed is query'
+            f' {design.ports[query].role!r}; must be query'
         )
     learner = design.learner
     if learner is None or learner.kind not in _LEARNERS:
@@ -59,6 +59,6 @@ class Advice(policies.Follower, base.Provider):
     if expected != self.delay:
       raise ValueError(
           f'query_delay: {self.delay} here, and {expected!r} in the learner'
-          f' {learner.kind}; allowed is the same in both: 0 for the query of'
+          f' {learner.kind}; must be the same in both: 0 for the query of'
           ' the current step, or 1 for that of the previous one'
       )

@@ -39,13 +39,13 @@ class Appraisal(base.Provider):
   def _fitting(self) -> 'Appraisal':
     if not self.reads or len(self.reads) % 2:
       raise ValueError(
-          f'reads: {len(self.reads)} registers; allowed are as many counts as'
+          f'reads: {len(self.reads)} registers; must be as many counts as'
           ' values'
       )
     values = self.reads[len(self.reads) // 2 :] if self.drift else ()
     if self.writes[1:] != values:
       raise ValueError(
-          f'writes: {list(self.writes)}; allowed are the reward'
+          f'writes: {list(self.writes)}; must be the reward'
           + (f' and then the values in reads, {list(values)}' if values else '')
           + ('' if values else ' alone, without a drift')
       )

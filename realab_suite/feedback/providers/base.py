@@ -126,7 +126,7 @@ class Provider(validation.Model):
     if solver is None:
       raise errors.SpecError(
           f'{self.kind} names {policies.SOLVER!r}, but this world has none;'
-          ' allowed are names of policies'
+          ' name other policies'
       )
     return type(self).model_validate(found)
 

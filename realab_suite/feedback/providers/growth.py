@@ -26,7 +26,7 @@ class WeightedSum(base.Provider):
     if self.weights is not None and len(self.weights) != len(self.reads):
       raise ValueError(
           f'weights: {len(self.weights)} for {len(self.reads)} registers;'
-          ' allowed is one for each'
+          ' must be one for each'
       )
     return self
 

@@ -89,16 +89,16 @@ class Inspection(base.Provider):
     if self.reads[-1] != self.writes[-1]:
       raise ValueError(
           f'reads ends with {self.reads[-1]!r}, and writes with'
-          f' {self.writes[-1]!r}; allowed is the budget as the last of both'
+          f' {self.writes[-1]!r}; must be the budget as the last of both'
       )
     if self.suspects not in (None, *self.reads[:-1]):
       raise ValueError(
-          f'suspects: {self.suspects!r}; allowed are {list(self.reads[:-1])}'
+          f'suspects: {self.suspects!r}; must be among {list(self.reads[:-1])}'
       )
     if (paid := self.pays) is not None:
       if paid.every != 1 or paid.senses != base.OF_AGENT:
         raise ValueError(
-            'pays: every and senses are given; allowed are those of the'
+            'pays: every and senses are given, but are those of the'
             ' inspection'
         )
       number = len(paid.writes)
@@ -107,12 +107,12 @@ class Inspection(base.Provider):
       }:
         raise ValueError(
             f'pays reads {list(paid.reads)} and writes {list(paid.writes)};'
-            ' allowed are names in reads, and the first ones in writes'
+            ' must be names in reads, and the first ones in writes'
         )
     low, high = self.plausible
     if low > high:
       raise ValueError(
-          f'plausible: {[low, high]}; allowed are the lowest reading and then'
+          f'plausible: {[low, high]}; must be the lowest reading and then'
           ' the highest one'
       )
     fields = type(self).model_fields
@@ -121,11 +121,9 @@ class Inspection(base.Provider):
     for name in (*scores, *fines):
       if (value := getattr(self, name)) != fields[name].default:
         needed = 'pays' if name in fines else 'suspects'
-        raise ValueError(f'{name}: {value}; allowed is none without {needed}')
+        raise ValueError(f'{name}: {value}; must not be given without {needed}')
     if not self.detectors:
-      raise ValueError(
-          f'reads: {list(self.reads)}; allowed are those with a detector, too'
-      )
+      raise ValueError(f'reads: {list(self.reads)}; must include a detector')
     return self
 
   @property
@@ -159,7 +157,7 @@ class Inspection(base.Provider):
       if design.ports[name].role != 'meter':
         raise ValueError(
             f'reads: {name!r}, whose role is {design.ports[name].role!r}, as a'
-            ' detector; allowed is meter'
+            ' detector; its role must be meter'
         )
       if (most := design.ports[name].range[1]) <= _SEEN:
         raise ValueError(
@@ -171,13 +169,13 @@ class Inspection(base.Provider):
     if budget.role != 'memory':
       raise ValueError(
           f'reads: {name!r}, whose role is {budget.role!r}, as the budget;'
-          ' allowed is memory'
+          ' its role must be memory'
       )
     initial = budget.initial
     if isinstance(initial, str) or initial < self.price:
       given = initial if isinstance(initial, str) else f'{initial:g}'
       raise ValueError(
-          f'registers.{name}.initial: a budget of {given}; allowed is at least'
+          f'registers.{name}.initial: a budget of {given}; must be at least'
           f' the price of one inspection, {self.price:g}, as a number'
       )
     if budget.range[0] > 0:
@@ -205,7 +203,7 @@ class Inspection(base.Provider):
       if isinstance(above, int | float) and most <= above:
         raise ValueError(
             f'writes: {name!r} holds {most:g} at most, and the learner heeds'
-            f' what is above {above:g}; allowed are a larger range, and a'
+            f' what is above {above:g}; give a larger range, or a'
             ' smaller learner.defence.above'
         )
 

@@ -46,7 +46,7 @@ def check_clip(design: Any, register: str, clip: int) -> None:
     return
   if (given := defence.get('clip', clip)) != clip:
     raise ValueError(
-        f'learner.defence.clip: {messages.quote(given)}; allowed is that of the'
+        f'learner.defence.clip: {messages.quote(given)}; must be that of the'
         f' comparisons, {clip}'
     )
 

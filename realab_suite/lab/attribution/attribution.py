@@ -228,8 +228,8 @@ class Attributor(events.BatchEventSink):
         episodes[-1].append(entry)
     if not 0 <= episode < len(episodes):
       raise errors.ResultsError(
-          f'episode: {episode}; allowed are the {len(episodes)} episodes that'
-          f' world {world} has begun, from 0'
+          f'episode: {episode}; must be one of the {len(episodes)} episodes'
+          f' that world {world} has begun, from 0'
       )
     steps = episodes[episode]
     nothing = np.zeros(len(steps))

@@ -76,8 +76,8 @@ def attacked(design: specs.DesignSpec, target: str | None = None) -> list[str]:
   """
   if target is not None and target not in design.registers:
     raise errors.SpecError(
-        f'design {design.name!r} has no register {target!r}; allowed are'
-        f' {sorted(design.registers)}'
+        f'design {design.name!r} has no register {target!r}; must be'
+        f' one of {sorted(design.registers)}'
     )
   consumed = [] if design.objective is None else design.objective.registers
   ending = [

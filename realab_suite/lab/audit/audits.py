@@ -97,8 +97,8 @@ class Auditor:
     names = aiming.attacked(design, settings.target)
     if movable and not names:
       raise errors.SpecError(
-          f'target: nothing can move register {settings.target!r}; allowed are'
-          f' {movable}'
+          f'target: nothing can move register {settings.target!r}; must be'
+          f' one of {movable}'
       )
     with contextlib.closing(world.load(design, settings.seed_of(0))) as env:
       env.reset()

@@ -87,8 +87,8 @@ class RunSpec(validation.Spec):
     needed = self.twin and self.data is not None
     if needed != (self.twin_data is not None):
       raise ValueError(
-          'twin_data: goes with data and twin; allowed are all three, data'
-          ' alone, and neither'
+          'twin_data: goes with data and twin; give all three, data'
+          ' alone, or neither'
       )
     return self
 
@@ -154,7 +154,7 @@ class TrainingSpec(validation.Spec):
   def _check_tasks(self) -> 'TrainingSpec':
     if bool(self.tasks) != (self.adaptation is not None):
       raise ValueError(
-          'tasks and adaptation belong together; allowed are both and neither'
+          'tasks and adaptation belong together; give both or neither'
       )
     if twice := sorted({t for t in self.tasks if self.tasks.count(t) > 1}):
       raise ValueError(f'tasks: {", ".join(twice)} appears twice')
@@ -266,7 +266,7 @@ class ExperimentSpec(validation.Spec):
       if design.learner is None:
         raise ValueError(
             f'runs.{name}.learner: design {design.name!r} has no learner;'
-            ' allowed is a mapping with its kind'
+            ' give a mapping with its kind'
         )
       if run.data is not None and self.training.tasks:
         raise ValueError(
@@ -276,14 +276,14 @@ class ExperimentSpec(validation.Spec):
       if run.twin and design.channel == TWIN:
         raise ValueError(
             f'runs.{name}.twin: design {design.name!r} is {TWIN} already;'
-            ' allowed is false'
+            ' must be false'
         )
       self._designs[name] = run, design
     for task in self.training.tasks:
       if registry.HELD_OUT in registry.tags(*task_names.split(task)):
         raise ValueError(
-            f'training.tasks: {task} is held out; allowed are tasks that'
-            f' lack the tag {registry.HELD_OUT!r}, which is for judging'
+            f'training.tasks: {task} is held out; must be a task that'
+            f' lacks the tag {registry.HELD_OUT!r}, which is for judging'
         )
     return self
 
@@ -307,7 +307,7 @@ class ExperimentSpec(validation.Spec):
     for task in self.training.tasks:
       if task == self.task or task_names.split(task)[0] != domain:
         raise errors.SpecError(
-            f'training.tasks: {task}; allowed are tasks of {domain} other than'
+            f'training.tasks: {task}; must be a task of {domain} other than'
             f' {self.task}, which is judged'
         )
       with contextlib.closing(
@@ -316,7 +316,7 @@ class ExperimentSpec(validation.Spec):
         if (env.observation_spec(), env.action_spec()) != judged:
           raise errors.SpecError(
               f'training.tasks: {task} has other observations or actions than'
-              f' {self.task}; allowed are tasks that look alike'
+              f' {self.task}; must have the same'
           )
     if is_default:
       return
@@ -364,7 +364,7 @@ class ExperimentSpec(validation.Spec):
     solver = self.world.solver
     if SOLVER in self.baselines and solver is None:
       raise errors.SpecError(
-          f'baselines: {SOLVER}: {self.task} names no solver; allowed are'
+          f'baselines: {SOLVER}: {self.task} names no solver; name other'
           ' registered policies'
       )
     return {

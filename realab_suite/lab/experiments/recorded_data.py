@@ -130,14 +130,14 @@ def load(folder: str, env: _Environment, num_envs: int) -> RecordedBatch:
     is_fine = np.isfinite(values) & (low <= values) & (values <= high)
     if not is_fine.all():
       raise errors.ResultsError(
-          f'{file}: column {name!r} holds {values[~is_fine][0]}; allowed are'
+          f'{file}: column {name!r} holds {values[~is_fine][0]}; must be'
           f' finite numbers from {low} to {high}'
       )
   is_first, is_last = (columns['step_type'] == one for one in (_FIRST, _LAST))
   # The last step of an episode stands before the first one of the next.
   if not (len(is_first) and (is_first == np.roll(is_last, 1)).all()):
     raise errors.ResultsError(
-        f'{file}: {len(is_first)} steps; allowed are whole episodes, one after'
+        f'{file}: {len(is_first)} steps; must hold whole episodes, one after'
         ' the other, and at least one'
     )
   columns['discount'][is_first] = 1.0
@@ -178,7 +178,7 @@ def _file(folder: str) -> pathlib.Path:
   file = pathlib.Path(folder) / FILE
   if not file.is_file():
     raise errors.ResultsError(
-        f"{file}: missing; allowed is the folder 'agent' of an export in the"
+        f"{file}: missing; must be the folder 'agent' of an export in the"
         ' format parquet'
     )
   return file

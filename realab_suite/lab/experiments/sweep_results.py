@@ -337,7 +337,7 @@ def _run(folder: pathlib.Path, name: str, planned: Sequence[Job]) -> Run:
     path = folder / job.folder
     if path.is_symlink():
       raise errors.ResultsError(
-          f'{path}: a symbolic link; allowed are folders of the sweep'
+          f'{path}: must be a folder of the sweep, not a symbolic link'
       )
     if not (path / storage.DONE).exists():
       continue
@@ -376,7 +376,7 @@ def _rows(path: pathlib.Path, *runs: str) -> list[results.EpisodeResult]:
   for number, row in enumerate(rows, start=1):
     if row.info.run not in runs:
       raise errors.ResultsError(
-          f'{path}:{number}: a row of run {row.info.run!r}; allowed is'
+          f'{path}:{number}: a row of run {row.info.run!r}; must be'
           f' {" or ".join(map(repr, runs))}'
       )
   if not rows:
@@ -399,6 +399,6 @@ def check_stakes(
   if len(keys) > 1:
     raise errors.ResultsError(
         f'{folder}: the rows of run {name!r} have stakes with the keys'
-        f' {", ".join(keys)}; allowed is one key, so run it again in another'
+        f' {", ".join(keys)}, not with one; run it again in another'
         ' folder'
     )

@@ -31,7 +31,7 @@ def use_one() -> None:
   for flag in flags:
     if not flag.startswith('--'):
       raise errors.SpecError(
-          f'{_XLA_FLAGS}: {flag!r:.80}; allowed are flags that begin with --,'
+          f'{_XLA_FLAGS}: {flag!r:.80}; must begin with --,'
           f' such as {_XLA_ONE}'
       )
   os.environ[_XLA_FLAGS] = ' '.join([*xla_flags(), _XLA_ONE])

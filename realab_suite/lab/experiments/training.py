@@ -185,7 +185,7 @@ def _check_learner(design: specs.DesignSpec) -> None:
     if name not in written:
       raise errors.SpecError(
           f'learner.defence: listens to {name!r}, which is no register that a'
-          f' provider writes; allowed are {sorted(written)}'
+          f' provider writes; must be one of {sorted(written)}'
       )
 
 

@@ -233,7 +233,7 @@ def _checked(
     if not is_right.all():
       episode = int(np.argmin(is_right))
       raise errors.ResultsError(
-          f'{where}: {array[episode]} in episode {episode}; allowed are finite'
+          f'{where}: {array[episode]} in episode {episode}; must be finite'
           f' values within the bounds {bounds}'
       )
     checked.append(np.clip(array, low, high))

@@ -53,7 +53,7 @@ def test_recorded_answers_repeat_an_episode(tmp_path):
 def test_a_file_that_has_no_answers_is_refused(tmp_path):
   file = tmp_path / 'answers.jsonl'
   file.write_text('{"asks": "approval"}\n')
-  with pytest.raises(errors.SpecError, match='allowed are files of answers'):
+  with pytest.raises(errors.SpecError, match='must be a file of answers'):
     answer_sources.Recorded(str(file))
 
 

@@ -183,7 +183,7 @@ def test_actions_of_another_shape_or_type_are_refused(action):
 @pytest.mark.parametrize(
     ('options', 'message'),
     [
-        ({'reward_register': 'score'}, r"allowed are None .*\['reward'\]"),
+        ({'reward_register': 'score'}, r"must be None .*\['reward'\]"),
         ({'dtype': 'float16'}, "must be 'float32' or 'float64'"),
         ({'render_mode': 'human'}, "must be 'rgb_array' or None"),
         ({'flat': 'yes'}, "flat: must be .*'yes'"),

@@ -195,7 +195,7 @@ def test_what_says_nothing_about_its_pay_is_not_judged(defence, reason):
         ({'kind': 'paying', 'cost': 'fines'}, "'fines' is not a register that"),
         ({'kind': 'mona', 'query': 'query'}, r'defence\.approval: req'),
         ({'kind': 'mona', 'approval': 'reward', 'query': 'query'},
-         "defence.approval: 'reward'; allowed is another register than that"),
+         "defence.approval: 'reward'; must be another register than that"),
         ({'kind': 'deaf', 'weights': ['gift']}, r"'deaf': pays \['gift'\]; "),
         ({'kind': 'deaf', 'weights': {'reward': 0.0}},
          r"'deaf': pays \{'reward': 0.0\}; all"),

@@ -454,7 +454,9 @@ def test_each_episode_begins_without_parts():
   assert again.world == pytest.approx([0.01, 0.02, 0.03], abs=1e-4)
   np.testing.assert_array_equal(again.agent, 0.0)
   assert len(attributor.attribution(1).registers['reward'].total) == 11
-  with pytest.raises(errors.ResultsError, match='2; allowed are the 2 episode'):
+  with pytest.raises(
+      errors.ResultsError, match='2; must be one of the 2 episode'
+  ):
     attributor.attribution(0, 2)
   batch.close()
 

@@ -128,7 +128,7 @@ def test_consumed_registers_are_attacked_first_and_secure_ones_never():
   assert aiming.attacked(specs.load(design), 'gauge') == ['gauge']
   assert aiming.attacked(specs.load(design), 'safe') == []
   assert aiming.attacked(specs.load(design, ['channel=secure'])) == []
-  with pytest.raises(errors.SpecError, match="'gauges'; allowed are"):
+  with pytest.raises(errors.SpecError, match="'gauges'; must be"):
     aiming.attacked(specs.load(design), 'gauges')
 
 

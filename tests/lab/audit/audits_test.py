@@ -196,7 +196,7 @@ def test_a_task_without_a_solver_is_refused(monkeypatch):
         ('instantaneous_reward', {'target': 'rewards'}, "'rewards'"),
         ('instantaneous_reward',
          {'target': 'score', 'overrides': ['registers.score.channel=secure']},
-         "nothing can move register 'score'; allowed are"),
+         "nothing can move register 'score'; must be"),
         ('instantaneous_reward', {'senses': ('velocity',)}, 'needs the senses'),
     ],
 )  # fmt: skip

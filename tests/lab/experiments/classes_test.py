@@ -247,14 +247,14 @@ def test_the_order_of_the_tasks_is_part_of_the_configuration():
          'training: tasks: good_objects.member_1 appears twice'),
         # Those that a run is judged in.
         ({'tasks': [f'{_DOMAIN}.member_5']},
-         'runs.reward: training.tasks: good_objects.member_5; allowed are'),
+         'runs.reward: training.tasks: good_objects.member_5; must be'),
         ({'tasks': [f'{_DOMAIN}.member_6']},
          'runs.other: training.tasks: good_objects.member_6; allowed'),
         # One that no run is judged in.
         ({'tasks': [f'{_DOMAIN}.member_6'], 'only': ['reward']},
-         'training.tasks: good_objects.member_6 is held out; allowed are'),
+         'training.tasks: good_objects.member_6 is held out; must be'),
         ({'tasks': ['assistant.train']},
-         'runs.reward: training.tasks: assistant.train; allowed are tasks'),
+         'runs.reward: training.tasks: assistant.train; must be a task'),
     ],
 )  # fmt: skip
 def test_wrong_tasks_are_refused_in_one_line(monkeypatch, changes, problem):

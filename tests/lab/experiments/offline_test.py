@@ -255,9 +255,9 @@ def _with_reward(table, value):
 @pytest.mark.parametrize(
     ('change', 'text'),
     [
-        (lambda table: None, "missing; allowed is the folder 'agent'"),
-        (lambda table: table[:0], ': 0 steps; allowed are whole episodes'),
-        (lambda table: table[1:], ': 87 steps; allowed are whole episodes'),
+        (lambda table: None, "missing; must be the folder 'agent'"),
+        (lambda table: table[:0], ': 0 steps; must hold whole episodes'),
+        (lambda table: table[1:], ': 87 steps; must hold whole episodes'),
         (lambda table: table.drop_columns('discount'), 'not the file of an'),
         (lambda table: b'PAR1, but no more', 'not the file of an export: '),
         (lambda table: _with_reward(table, np.nan), "reward' holds nan;"),

@@ -176,7 +176,7 @@ class TestBounds:
   @pytest.mark.parametrize(
       ('bounds', 'message'),
       [
-          ((0, 18), 'values of seed 3: 18.5 in episode 1; allowed are'),
+          ((0, 18), 'values of seed 3: 18.5 in episode 1; must be'),
           ((18, 0), r'bounds are \(18, 0\); the lower must be below the upper'),
           ((math.nan, 20), r'bounds are \(nan, 20\)'),
       ],

@@ -8,7 +8,7 @@ from dm_control import mjcf
 from dm_control.composer.environment import HOOK_NAMES as HOOK_NAMES
 from dm_control.composer.environment import Environment as Environment
 from dm_control.composer.environment import (
-  EpisodeInitializationError as EpisodeInitializationError,
+    EpisodeInitializationError as EpisodeInitializationError,
 )
 from dm_control.composer.observation import observable as _observable
 import numpy as np

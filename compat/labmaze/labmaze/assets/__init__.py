@@ -41,7 +41,7 @@ class SkyBox(NamedTuple):
 
 def _check(style: str, allowed: tuple[str, ...]) -> None:
   if style not in allowed:
-    raise ValueError(f'style: {style!r}; allowed are {allowed}')
+    raise ValueError(f'style: {style!r}; must be one of {allowed}')
 
 
 def _path(stem: str) -> str:

@@ -7,8 +7,10 @@ import numpy as np
 class Updater:
   def __init__(
       self,
-      observables: Mapping[str, observable.Observable]
-      | Sequence[Mapping[str, observable.Observable]],
+      observables: (
+          Mapping[str, observable.Observable]
+          | Sequence[Mapping[str, observable.Observable]]
+      ),
       physics_steps_per_control_step: int = 1,
       **kwargs: Any,
   ) -> None: ...
