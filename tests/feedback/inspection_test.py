@@ -262,11 +262,11 @@ _WRONG = {
         'providers[0]: registers.budget.initial: a budget of 0; must be at'
         ' least the price of one inspection, 1',
     'registers.budget.role=signal':
-        "reads: 'budget', whose role is 'signal', as the budget; its role must be"
-        ' memory',
+        "reads: 'budget', whose role is 'signal', as the budget; its role must"
+        ' be memory',
     'providers.0.reads=[meter_a, alarm, budget]':
-        "reads: 'alarm', whose role is 'signal', as a detector; its role must be"
-        ' meter',
+        "reads: 'alarm', whose role is 'signal', as a detector; its role must"
+        ' be meter',
     'providers.0.reads=[meter_a, budget]':
         "providers[0]: reads: ['meter_a', 'budget']; must be those with a"
         ' detector, too',

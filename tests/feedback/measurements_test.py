@@ -240,16 +240,16 @@ _REFUSED = {
     'needs options': ('distance', r"'distance' needs the options \['from', 't"),
     'no such name': (
         {'kind': 'distance', 'from': 'avatar', 'to': 'pda'},
-        r"meters\[0\].measures.to: 'pda' .*must be one of \['apples', 'avatar'.*"
+        r"meters\[0\].measures.to: 'pda' .* one of \['apples', 'avatar'.*"
         r"'reward', 'score'\]",
     ),
     'a group': (
         {'kind': 'position', 'of': 'apples', 'axis': 'x'},
-        r"measures.of: 'apples' has 8 bodies; allowed .*'avatar'",
+        r"measures.of: 'apples' has 8 bodies; must be .*'avatar'",
     ),
     'no velocity': (
         {'kind': 'speed', 'of': 'door'},
-        r"measures.of: 'door' .* must be one of \['avatar', 'reward', 'score'\]",
+        r"measures.of: 'door' .* one of \['avatar', 'reward', 'score'\]",
     ),
     'nothing to touch': (
         {'kind': 'contacts', 'of': 'avatar', 'with': 'apples'},

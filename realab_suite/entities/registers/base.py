@@ -262,8 +262,7 @@ class Register(kinds.Kind):
   def pose(self, physics: protocols.Physics, value: Any) -> None:
     """Moves the blocks to the undisturbed poses that represent a value.
 
-    Unlike `write`, this restores the whole pose of the blocks, and obstacles
-    have no influence.
+    Unlike `write`, this ignores obstacles.
 
     Args:
       physics: One world or a batch of worlds.

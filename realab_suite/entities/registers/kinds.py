@@ -123,7 +123,8 @@ class Kind(modelled.ModelledEntity):
   def _permanent(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the permanent corruption, `(...)`, in the register's units.
 
-    It is the corruption that readings have immediately after a write.
+    It is the own corruption that readings have immediately after a write that
+    nothing obstructs.
     """
     return np.zeros_like(self._slots.of(physics).applied)
 
