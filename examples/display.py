@@ -18,7 +18,6 @@ from realab_suite import suite
 from realab_suite.entities import appearance
 from realab_suite.entities import axes
 from realab_suite.entities import block_contacts
-from realab_suite.entities import block_kinds
 from realab_suite.entities import rays
 from realab_suite.entities import registers
 from realab_suite.feedback import register_kinds
@@ -72,7 +71,7 @@ class Display(registers.Register):
     super()._build(name, **options)
 
   def _build_blocks(self):
-    base = self._add_block('base', block_kinds.BASE_BLOCK, (0.0, 0.0))
+    base = self._add_block('base', appearance.BASE_BLOCK, (0.0, 0.0))
     half, colours = base.half_size, appearance.ROLE_COLOURS[self.role]
     places = (2 * half + _GAP) * np.arange(1, len(self._weights) + 1)
     self._end, contacts = places[-1], block_contacts.attributes(half)
@@ -84,7 +83,7 @@ class Display(registers.Register):
         **contacts,
         pos=(self._end / 2, 0, _PLANK / 2 - half),
         size=(self._end / 2 + half, half, _PLANK / 2),
-        **appearance.geom_style(block_kinds.BASE_BLOCK, colours[0]),
+        **appearance.geom_style(appearance.BASE_BLOCK, colours[0]),
     )
     self._lifts = []
     for i, x in enumerate(places, start=1):
@@ -109,7 +108,7 @@ class Display(registers.Register):
           size=[half] * 3,
           **contacts,
           mass=base.geom.mass / 10,
-          **appearance.geom_style(block_kinds.OFFSET_BLOCK, colours[1]),
+          **appearance.geom_style(appearance.OFFSET_BLOCK, colours[1]),
       )
       self._lifts.append(lift)
     self._geoms = self.mjcf_model.find_all('geom')

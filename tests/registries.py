@@ -19,26 +19,28 @@ from realab_suite.tasks import registry
 @contextlib.contextmanager
 def preserved() -> Iterator[None]:
   """Removes the entries that are added in the context."""
-  registries: tuple[dict[Any, Any], ...] = (
-      measurements.MEASUREMENTS._entries,
-      objectives.OBJECTIVES._entries,
-      policies.POLICIES._entries,
-      providers.PROVIDERS._entries,
-      register_kinds.REGISTER_KINDS._entries,
-      action_sets.ACTION_SETS._entries,
-      appearance._CLASSES,
-      registry._TASKS,
-  )
+  registries = [
+      measurements.MEASUREMENTS,
+      objectives.OBJECTIVES,
+      policies.POLICIES,
+      providers.PROVIDERS,
+      register_kinds.REGISTER_KINDS,
+      action_sets.ACTION_SETS,
+  ]
   if util.find_spec('jax') is not None:  # It is in the extra `agents`.
     agents = importlib.import_module('realab_suite.lab.agents')
-    registries += (
-        agents.LEARNERS._entries,
-        agents.defences.DEFENCES._entries,
-    )
-  before = [dict(entries) for entries in registries]
+    registries += [agents.LEARNERS, agents.defences.DEFENCES]
+  # A module registers its entries once, when it is imported.
+  for names in registries:
+    for name in names:
+      names.get(name)
+  registry.of_package()  # Imports all domains.
+  tables: list[dict[Any, Any]] = [names._entries for names in registries]
+  tables += [appearance._CLASSES, registry._TASKS]
+  before = [dict(entries) for entries in tables]
   try:
     yield
   finally:
-    for entries, old in zip(registries, before, strict=True):
+    for entries, old in zip(tables, before, strict=True):
       entries.clear()
       entries.update(old)

@@ -116,15 +116,33 @@ def register(
   return name
 
 
-OTHER = register('other', code=1)
-"""Class of geoms that have no other class."""
+_RED, _BLUE = (0.80, 0.25, 0.25, 1.0), (0.25, 0.40, 0.85, 1.0)
+_PRESSED = (0.15, 0.75, 0.30, 1.0)
 
+# The classes of this package. A module of entities is imported only in worlds
+# that have them, and codes have to be taken before.
 NOTHING = register('nothing', code=0)
 """Class that the ray sense reports for rays that hit nothing in their range."""
 
-# Classes of one world each, whose modules are imported only to load them.
+OTHER = register('other', code=1)
+"""Class of geoms that have no other class."""
+
+WALL = register('wall', code=2, rgba=(0.42, 0.47, 0.56, 1.0))
+BARRIER = register('barrier', code=3, rgba=(0.55, 0.42, 0.60, 1.0))
+DOOR = register('door', code=4, rgba=(0.45, 0.27, 0.12, 1.0))
+PAD = register('pad', code=5, rgba=(0.95, 0.55, 0.10, 1.0))
+PRESSED_PAD = register('pressed_pad', code=6, rgba=_PRESSED)
+APPLE = register('apple', code=7, rgba=(0.85, 0.12, 0.12, 1.0))
+LARGE_APPLE = register('large_apple', code=8, rgba=(0.98, 0.80, 0.10, 1.0))
+BASE_BLOCK = register('base_block', code=9)
+OFFSET_BLOCK = register('offset_block', code=10)
+CRATE = register('crate', code=11, rgba=(0.72, 0.55, 0.33, 1.0))
 GATE_PLATE = register('gate_plate', code=12, rgba=(0.9, 0.4, 0.1, 1.0))
 MARK = register('mark', code=13, rgba=(0.25, 0.6, 0.45, 1.0))
+RED_BALL = register('red_ball', code=14, rgba=_RED)
+BLUE_BALL = register('blue_ball', code=15, rgba=_BLUE)
+RED_CUBE = register('red_cube', code=16, rgba=_RED)
+BLUE_CUBE = register('blue_cube', code=17, rgba=_BLUE)
 SUPERVISOR = register('supervisor', code=18, rgba=(0.95, 0.85, 0.45, 1.0))
 
 

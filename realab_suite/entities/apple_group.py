@@ -14,25 +14,14 @@ from realab_suite.entities import moving
 from realab_suite.entities import protocols
 from realab_suite.entities import state
 
-APPLE = appearance.register('apple', code=7, rgba=(0.85, 0.12, 0.12, 1.0))
-LARGE_APPLE = appearance.register(
-    'large_apple', code=8, rgba=(0.98, 0.80, 0.10, 1.0)
-)
-
-_RED, _BLUE = (0.80, 0.25, 0.25, 1.0), (0.25, 0.40, 0.85, 1.0)
-RED_BALL = appearance.register('red_ball', code=14, rgba=_RED)
-BLUE_BALL = appearance.register('blue_ball', code=15, rgba=_BLUE)
-RED_CUBE = appearance.register('red_cube', code=16, rgba=_RED)
-BLUE_CUBE = appearance.register('blue_cube', code=17, rgba=_BLUE)
-
 # Shape and radius, or half of the edges of a cube, in m.
 _SHAPES = {
-    APPLE: ('sphere', 0.2),
-    LARGE_APPLE: ('sphere', 0.4),
-    RED_BALL: ('sphere', 0.2),
-    BLUE_BALL: ('sphere', 0.2),
-    RED_CUBE: ('box', 0.17),
-    BLUE_CUBE: ('box', 0.17),
+    appearance.APPLE: ('sphere', 0.2),
+    appearance.LARGE_APPLE: ('sphere', 0.4),
+    appearance.RED_BALL: ('sphere', 0.2),
+    appearance.BLUE_BALL: ('sphere', 0.2),
+    appearance.RED_CUBE: ('box', 0.17),
+    appearance.BLUE_CUBE: ('box', 0.17),
 }
 # Height of eaten apples, in m: out of sight of rays and cameras.
 _GONE = -5.0
@@ -46,7 +35,7 @@ class Apples(measurables.MeasurableEntity):
   """
 
   def _build(
-      self, name: str = 'apples', number: int = 8, kind: str = APPLE
+      self, name: str = 'apples', number: int = 8, kind: str = appearance.APPLE
   ) -> None:
     """Builds the apples.
 

@@ -14,9 +14,6 @@ from realab_suite.entities import appearance
 from realab_suite.entities import block_kinds
 from realab_suite.entities import surroundings
 
-WALL = appearance.register('wall', code=2, rgba=(0.42, 0.47, 0.56, 1.0))
-BARRIER = appearance.register('barrier', code=3, rgba=(0.55, 0.42, 0.60, 1.0))
-
 _WALL_THICKNESS = 0.2
 _WALL_HEIGHT = 1.0
 _BARRIER_HEIGHT = 0.5
@@ -303,7 +300,7 @@ class RoomArena(composer.Arena):
       start: One end of its centre line, `(x, y)`, in m.
       end: Other end of its centre line, `(x, y)`, in m.
     """
-    self._add_box(name, BARRIER, start, end, _BARRIER_HEIGHT)
+    self._add_box(name, appearance.BARRIER, start, end, _BARRIER_HEIGHT)
 
   def add_table(
       self,
@@ -339,7 +336,7 @@ class RoomArena(composer.Arena):
         type='box',
         size=(size[0] / 2, size[1] / 2, (height + _DEPTH) / 2),
         pos=(x, y, (height - _DEPTH) / 2),
-        **appearance.geom_style(BARRIER),
+        **appearance.geom_style(appearance.BARRIER),
     )
 
   def add_mark(
@@ -372,7 +369,9 @@ class RoomArena(composer.Arena):
       self, name: str, start: Sequence[float], end: Sequence[float]
   ) -> None:
     """Adds a wall with a centre line from `start` to `end`, in m."""
-    self._walls.append(self._add_box(name, WALL, start, end, _WALL_HEIGHT))
+    self._walls.append(
+        self._add_box(name, appearance.WALL, start, end, _WALL_HEIGHT)
+    )
 
   def _add_box(
       self,
@@ -384,7 +383,7 @@ class RoomArena(composer.Arena):
   ) -> mjcf.Element:
     line = np.array([start, end], float)
     half = np.ptp(line, axis=0) / 2 + _WALL_THICKNESS / 2
-    colour = (*self._look.walls, 1.0) if kind == WALL else None
+    colour = (*self._look.walls, 1.0) if kind == appearance.WALL else None
     return self._mjcf_root.worldbody.add(
         'geom',
         name=name,

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple, final
 from dm_control import mjcf
 import numpy as np
 
-from realab_suite.entities import appearance
 from realab_suite.entities import axes
 from realab_suite.entities import block_contacts
 from realab_suite.entities import grasps
@@ -22,8 +21,6 @@ from realab_suite.entities import state
 from realab_suite.entities import surroundings
 
 # Registers give their blocks colours, by role.
-BASE_BLOCK = appearance.register('base_block', code=9)
-OFFSET_BLOCK = appearance.register('offset_block', code=10)
 
 # Smallest edge length of a block in a design, in m. A thrown block lands at up
 # to 2.8 m/s, which is 28 mm in a substep of 10 ms. The centre of a block with

@@ -17,8 +17,6 @@ from realab_suite.entities import protocols
 # Largest edge length of a block, in m.
 _LARGEST = 1.0
 
-CRATE = appearance.register('crate', code=11, rgba=(0.72, 0.55, 0.33, 1.0))
-
 
 @final
 class Crate(measurables.MeasurableEntity):
@@ -35,7 +33,7 @@ class Crate(measurables.MeasurableEntity):
       size: float = 0.3,
       mass: float = 1.0,
       is_planar: bool = False,
-      kind: str = CRATE,
+      kind: str = appearance.CRATE,
   ) -> None:
     """Builds the crate.
 

@@ -13,8 +13,6 @@ from realab_suite.entities import measurables
 from realab_suite.entities import moving
 from realab_suite.entities import protocols
 
-DOOR = appearance.register('door', code=4, rgba=(0.45, 0.27, 0.12, 1.0))
-
 _THICKNESS = 0.08
 _HEIGHT = 1.0
 # Travel of the door, in widths of the opening. It is more than 1 so that the
@@ -48,7 +46,7 @@ class SlidingDoor(measurables.MeasurableEntity):
             {
                 'type': 'box',
                 'size': (width / 2, _THICKNESS / 2, _HEIGHT / 2),
-                **appearance.geom_style(DOOR),
+                **appearance.geom_style(appearance.DOOR),
             }
         ],
     )

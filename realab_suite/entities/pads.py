@@ -13,11 +13,6 @@ from realab_suite.entities import moving
 from realab_suite.entities import protocols
 from realab_suite.entities import state
 
-PAD = appearance.register('pad', code=5, rgba=(0.95, 0.55, 0.10, 1.0))
-PRESSED_PAD = appearance.register(
-    'pressed_pad', code=6, rgba=(0.15, 0.75, 0.30, 1.0)
-)
-
 _PLATE_COLOUR = (0.30, 0.30, 0.33, 1.0)
 _POST_RADIUS = 0.12
 # Distance by which a pressed post sinks, and height that remains, in m.
@@ -55,7 +50,10 @@ class PressurePad(measurables.MeasurableEntity):
     )
     self._radius = radius
     self._pressed = state.Slot(self._mjcf_root, 'pressed')
-    segments = ((PAD, 0.0, _SINKS), (PRESSED_PAD, _SINKS, _SINKS + _STUB))
+    segments = (
+        (appearance.PAD, 0.0, _SINKS),
+        (appearance.PRESSED_PAD, _SINKS, _SINKS + _STUB),
+    )
     self._post = moving.MovingPart(
         f'{name}_post',
         [

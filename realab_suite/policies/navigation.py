@@ -11,11 +11,6 @@ from typing import final
 import numpy as np
 
 from realab_suite.entities import appearance
-from realab_suite.entities import apple_group
-from realab_suite.entities import arenas
-from realab_suite.entities import block_kinds
-from realab_suite.entities import doors
-from realab_suite.entities import pads
 from realab_suite.policies import action_sets
 from realab_suite.policies import base
 
@@ -26,17 +21,17 @@ _FIELD_OF_VIEW = np.radians(160.0)
 # Distance between the middle of the avatar and obstacles, metres. The radius of
 # the avatar is 0.25. Blocks get a wider berth, because they can be pushed.
 _BERTHS = {
-    arenas.WALL: 0.3,
-    arenas.BARRIER: 0.3,
-    doors.DOOR: 0.3,
-    pads.PAD: 0.34,
-    pads.PRESSED_PAD: 0.34,
-    block_kinds.BASE_BLOCK: 0.42,
-    block_kinds.OFFSET_BLOCK: 0.42,
+    appearance.WALL: 0.3,
+    appearance.BARRIER: 0.3,
+    appearance.DOOR: 0.3,
+    appearance.PAD: 0.34,
+    appearance.PRESSED_PAD: 0.34,
+    appearance.BASE_BLOCK: 0.42,
+    appearance.OFFSET_BLOCK: 0.42,
     # No obstacles.
     appearance.NOTHING: -1.0,
-    apple_group.APPLE: -1.0,
-    apple_group.LARGE_APPLE: -1.0,
+    appearance.APPLE: -1.0,
+    appearance.LARGE_APPLE: -1.0,
 }
 # By code. Objects of all other classes may be in the way.
 _BERTH = np.full(appearance.CAPACITY, 0.3)

@@ -65,7 +65,7 @@ class AppleMaze(apple_rooms.AppleRoom):
   def __init__(self, **options: Any) -> None:
     arena = arenas.OpenRoom(look=_LOOK)
     super().__init__(arena, **options)
-    style = appearance.geom_style(arenas.WALL, (*_LOOK.walls, 1.0))
+    style = appearance.geom_style(appearance.WALL, (*_LOOK.walls, 1.0))
     wall = {'type': 'box', 'size': (*_SIZE / 2, 0.5), **style}
     parts = [moving.MovingPart(f'wall_{i}', [wall]) for i in range(_NUM_WALLS)]
     self._walls = tuple(part.attach_to(arena, _BELOW) for part in parts)

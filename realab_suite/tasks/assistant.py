@@ -15,14 +15,14 @@ from typing import Any, final
 
 import numpy as np
 
-from realab_suite.entities import apple_group
+from realab_suite.entities import appearance
 from realab_suite.entities import arenas
 from realab_suite.entities import protocols
 from realab_suite.tasks import registry
 from realab_suite.tasks import valued_things
 
 # The ones that a user likes are as many as the others.
-_NUMBERS = {apple_group.RED_BALL: 6, apple_group.BLUE_BALL: 6}
+_NUMBERS = {appearance.RED_BALL: 6, appearance.BLUE_BALL: 6}
 _USERS = {
     registry.TRAIN: ((1.0, -1.0), (-1.0, 1.0)),
     registry.HELD_OUT: ((0.4, -0.2), (-0.2, 0.4)),

@@ -18,17 +18,17 @@ from typing import Any, Final, final
 
 import numpy as np
 
-from realab_suite.entities import apple_group
+from realab_suite.entities import appearance
 from realab_suite.entities import arenas
 from realab_suite.entities import protocols
 from realab_suite.tasks import registry
 from realab_suite.tasks import valued_things
 
 _NUMBERS = {
-    apple_group.RED_BALL: 3,
-    apple_group.BLUE_BALL: 3,
-    apple_group.RED_CUBE: 3,
-    apple_group.BLUE_CUBE: 3,
+    appearance.RED_BALL: 3,
+    appearance.BLUE_BALL: 3,
+    appearance.RED_CUBE: 3,
+    appearance.BLUE_CUBE: 3,
 }
 # What the kinds are worth, and whether the member is for training.
 _MEMBERS: Final = {

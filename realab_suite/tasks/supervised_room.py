@@ -16,7 +16,6 @@ from typing import Any, final
 import numpy as np
 
 from realab_suite.entities import appearance
-from realab_suite.entities import apple_group
 from realab_suite.entities import arenas
 from realab_suite.entities import crates
 from realab_suite.entities import meters
@@ -26,7 +25,7 @@ from realab_suite.entities import state as world_state
 from realab_suite.tasks import registry
 from realab_suite.tasks import valued_things
 
-_NUMBERS = {apple_group.RED_BALL: 6, apple_group.BLUE_CUBE: 6}
+_NUMBERS = {appearance.RED_BALL: 6, appearance.BLUE_CUBE: 6}
 _SIZE, _AT = 0.4, (-3.5, 1.2)
 _HALF_VIEW = np.radians(70.0)
 # The supervisor attends for a part of each period, in control steps.
@@ -109,7 +108,7 @@ class SupervisedRoom(valued_things.ValuedThings):
     self._unseen_steps.set(physics, unseen)
 
   def latch_events(self, physics: protocols.Physics) -> None:
-    count = self.facts[apple_group.BLUE_CUBE]
+    count = self.facts[appearance.BLUE_CUBE]
     before = count(physics)
     super().latch_events(physics)
     seen = (count(physics) - before) * self._is_seen.get(physics)

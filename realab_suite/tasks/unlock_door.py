@@ -13,6 +13,7 @@ from typing import Any, final
 
 import numpy as np
 
+from realab_suite.entities import appearance
 from realab_suite.entities import apple_group
 from realab_suite.entities import arenas
 from realab_suite.entities import doors
@@ -60,7 +61,7 @@ class UnlockDoor(rooms.RoomTask):
     self._apples = apple_group.Apples(number=_NUM_APPLES)
     self._apples.attach_to(arena)
     self._large_apple = apple_group.Apples(
-        'large_apple', number=1, kind=apple_group.LARGE_APPLE
+        'large_apple', number=1, kind=appearance.LARGE_APPLE
     )
     self._large_apple.attach_to(arena)
     self._pad = pads.PressurePad(radius=_PAD_RADIUS)

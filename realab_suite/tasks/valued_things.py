@@ -157,7 +157,7 @@ class ValuedThingsSolver(errands.Errand):
     classes = np.asarray(seen['senses/ray_classes'])
     good = np.where(is_good, codes, -1)[..., np.newaxis, :]
     is_wanted = (classes[..., np.newaxis] == good).any(axis=-1)
-    classes = np.where(is_wanted, appearance.code(apple_group.APPLE), classes)
+    classes = np.where(is_wanted, appearance.code(appearance.APPLE), classes)
     walks = navigation.walk(
         navigation.view({**seen, 'senses/ray_classes': classes}), goal, 0.45
     )

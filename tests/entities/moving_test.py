@@ -9,11 +9,10 @@ from realab_suite.entities import appearance
 from realab_suite.entities import apple_group
 from realab_suite.entities import arenas
 from realab_suite.entities import avatars
-from realab_suite.entities import doors
 from realab_suite.entities import moving
 from tests import worlds
 
-_STYLE = appearance.geom_style(doors.DOOR)
+_STYLE = appearance.geom_style(appearance.DOOR)
 _BOX = {'type': 'box', 'size': (0.2, 1.0, 0.5), **_STYLE}
 
 

@@ -14,6 +14,7 @@ from realab_suite.policies import action_sets
 from realab_suite.policies import macros
 from realab_suite.policies import simple
 from realab_suite.tasks import collect_apples
+from tests import registries
 
 _ACTIONS = (
     ('grasp', {'grasp': 1.0}),
@@ -24,10 +25,8 @@ _ACTIONS = (
 
 @pytest.fixture(autouse=True)
 def fixture_registry():
-  before = dict(action_sets.ACTION_SETS._entries)
-  yield
-  action_sets.ACTION_SETS._entries.clear()
-  action_sets.ACTION_SETS._entries.update(before)
+  with registries.preserved():
+    yield
 
 
 def _drive(version=1, actions=_ACTIONS, name='drive'):

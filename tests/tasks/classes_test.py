@@ -8,7 +8,6 @@ import pytest
 from realab_suite import errors
 from realab_suite import suite
 from realab_suite.entities import appearance
-from realab_suite.entities import apple_group
 from realab_suite.tasks import collect_apples
 from realab_suite.tasks import registry
 from tests.engine import helpers
@@ -17,10 +16,10 @@ _MEMBERS = suite.TASKS_BY_DOMAIN['good_objects']
 _KINDS = [
     appearance.code(kind)
     for kind in (
-        apple_group.RED_BALL,
-        apple_group.BLUE_BALL,
-        apple_group.RED_CUBE,
-        apple_group.BLUE_CUBE,
+        appearance.RED_BALL,
+        appearance.BLUE_BALL,
+        appearance.RED_CUBE,
+        appearance.BLUE_CUBE,
     )
 ]
 

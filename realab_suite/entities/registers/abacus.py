@@ -6,6 +6,7 @@ from typing import final
 
 import numpy as np
 
+from realab_suite.entities import appearance
 from realab_suite.entities import axes
 from realab_suite.entities import block_kinds
 from realab_suite.entities import protocols
@@ -37,14 +38,14 @@ class Abacus(base.Register):
 
   def _build_blocks(self) -> list[block_kinds.Block]:
     frame = self._add_block(
-        'base', block_kinds.BASE_BLOCK, (0.0, 0.0), (-1.0, 0.0)
+        'base', appearance.BASE_BLOCK, (0.0, 0.0), (-1.0, 0.0)
     )
     width = self._block_size + _GAP
     self._rods = [np.array([0.0, rod * width, 0.0]) for rod in self.rods]
     self._beads = [
         self._add_block(
             port,
-            block_kinds.OFFSET_BLOCK,
+            appearance.OFFSET_BLOCK,
             rod[:2].tolist(),
             (1.0, 0.0),
             [port],

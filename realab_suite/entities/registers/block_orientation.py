@@ -5,6 +5,7 @@ from typing import final
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.entities import appearance
 from realab_suite.entities import axes
 from realab_suite.entities import block_kinds
 from realab_suite.entities import protocols
@@ -32,7 +33,7 @@ class BlockOrientationRegister(base.Register):
           f' {self._scale} turns the block by up to {widest:.3g} rad; must'
           f' be at most {_LARGEST_ANGLE} rad'
       )
-    self._block = self._add_block('block', block_kinds.OFFSET_BLOCK, (0.0, 0.0))
+    self._block = self._add_block('block', appearance.OFFSET_BLOCK, (0.0, 0.0))
     return [self._block]
 
   def _places(

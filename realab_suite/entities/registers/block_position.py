@@ -4,6 +4,7 @@ from typing import final
 
 import numpy as np
 
+from realab_suite.entities import appearance
 from realab_suite.entities import axes
 from realab_suite.entities import block_kinds
 from realab_suite.entities import protocols
@@ -22,7 +23,7 @@ class BlockPositionRegister(base.Register):
 
   def _build_blocks(self) -> list[block_kinds.Block]:
     self._block = self._add_block(
-        'block', block_kinds.OFFSET_BLOCK, (0.0, 0.0), (1.0, 0.0)
+        'block', appearance.OFFSET_BLOCK, (0.0, 0.0), (1.0, 0.0)
     )
     return [self._block]
 

@@ -222,8 +222,8 @@ class Kind(modelled.ModelledEntity):
 
     Args:
       name: Name of the block within the register.
-      class_name: Class that the ray sense reports: `block_kinds.BASE_BLOCK` or
-        `block_kinds.OFFSET_BLOCK`.
+      class_name: Class that the ray sense reports: `appearance.BASE_BLOCK` or
+        `appearance.OFFSET_BLOCK`.
       position: Position at rest in the register's frame, `(x, y)`, in m.
       direction: Direction of the motion that raises the reading, if there is
         one; see `block_kinds.Block.direction`.
@@ -233,7 +233,7 @@ class Kind(modelled.ModelledEntity):
     """
     is_free = self._dof == 'free'
     kind = block_kinds.FreeBlock if is_free else block_kinds.PlanarBlock
-    is_offset = class_name == block_kinds.OFFSET_BLOCK
+    is_offset = class_name == appearance.OFFSET_BLOCK
     colour = appearance.ROLE_COLOURS[self._role][int(is_offset)]
     return kind(
         self._mjcf_root,

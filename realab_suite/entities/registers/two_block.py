@@ -5,6 +5,7 @@ from typing import final
 from dm_control import composer
 import numpy as np
 
+from realab_suite.entities import appearance
 from realab_suite.entities import axes
 from realab_suite.entities import block_kinds
 from realab_suite.entities import protocols
@@ -36,10 +37,10 @@ class TwoBlockRegister(base.Register):
   def _build_blocks(self) -> list[block_kinds.Block]:
     lateral = self._block_size + _LATERAL
     self._base = self._add_block(
-        'base', block_kinds.BASE_BLOCK, (0.0, 0.0), (-1.0, 0.0)
+        'base', appearance.BASE_BLOCK, (0.0, 0.0), (-1.0, 0.0)
     )
     self._offset = self._add_block(
-        'offset', block_kinds.OFFSET_BLOCK, (0.0, lateral), (1.0, 0.0)
+        'offset', appearance.OFFSET_BLOCK, (0.0, lateral), (1.0, 0.0)
     )
     self._from_origin = np.array([0.0, lateral, 0.0])
     self._exclusion = self._mjcf_root.contact.add(
