@@ -95,9 +95,9 @@ def gained(
   """
   pairs = _pairs(name, _distinct(name, episodes), _distinct(name, others))
   differences: dict[int, list[float]] = {}
-  for one, other in pairs:
-    difference = one.true_return - other.true_return
-    differences.setdefault(one.seed, []).append(difference)
+  for episode, counterpart in pairs:
+    difference = episode.true_return - counterpart.true_return
+    differences.setdefault(episode.seed, []).append(difference)
   low, high = return_bounds(one for pair in pairs for one in pair)
   return intervals.mean_interval(
       differences,
@@ -163,9 +163,9 @@ def _distinct(name: str, episodes: _Episodes) -> list[results.EpisodeResult]:
   """
   distinct: dict[tuple[int, int, int], results.EpisodeResult] = {}
   for episode in episodes:
-    known = distinct.setdefault(episode.key, episode)
+    record = distinct.setdefault(episode.key, episode)
     # Compare representations, because nan is unequal to itself.
-    if known is not episode and repr(known) != repr(episode):
+    if record is not episode and repr(record) != repr(episode):
       raise errors.ResultsError(
           f'run {name!r} has two different records of (seed, world, episode)'
           f' {episode.key}'

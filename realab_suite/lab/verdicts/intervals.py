@@ -251,9 +251,9 @@ def _limits(bounds: Bounds) -> tuple[float, float]:
 
 def mean(values: np.ndarray) -> float:
   """Returns the mean, with a result that is independent of the order."""
-  found = math.fsum(values) / values.size
+  average = math.fsum(values) / values.size
   # Without this, rounding could make the mean of equal values differ from them.
-  return min(max(found, float(values.min())), float(values.max()))
+  return min(max(average, float(values.min())), float(values.max()))
 
 
 def _spread(means: np.ndarray, units: Sequence[np.ndarray]) -> float:

@@ -29,39 +29,39 @@ def of_mechanism(
     stake: Stakes of the design, or `None`.
   """
   design = mechanism.design
-  found = [
+  reasons = [
       f'meters[{i}] measures the blocks of {name!r}'
       for i, names in enumerate(mechanism.measured)
       for name in names
   ]
   # Plans of audits move blocks, and need not move any to blind an instrument.
-  found += [
+  reasons += [
       f'what is measured for {name!r} can be obstructed, which no audit tries'
       for name in mechanism.obstructible
   ]
   corruptible = _corruptible(design)
   for i, provider in enumerate(design.providers):
     name = f'providers[{i}]:{provider.kind}'
-    seen = [one for one in provider.sensed if one in instruments]
-    if seen:
-      found.append(
-          f'{name} sees through {" and ".join(seen)}, which blocks can affect'
+    senses = [one for one in provider.sensed if one in instruments]
+    if senses:
+      reasons.append(
+          f'{name} sees through {" and ".join(senses)}, which blocks can affect'
       )
     wrong = sorted(corruptible & set(specs.inputs_of(provider, design)))
     if not provider.is_repeatable and wrong:
-      found.append(
+      reasons.append(
           f'{name} cannot be asked twice, and {wrong[0]} can be corrupted'
       )
   if stake is not None:
-    found += [
+    reasons += [
         f'the stake of its {name} is degenerate' for name in stake.degenerate
     ]
-    found += [
+    reasons += [
         'the solver hardly earns anything here, so that the stake of its'
         f' {name} is not confirmed'
         for name in stake.unconfirmed
     ]
-  return found
+  return reasons
 
 
 def _corruptible(design: specs.DesignSpec) -> set[str]:
@@ -69,9 +69,9 @@ def _corruptible(design: specs.DesignSpec) -> set[str]:
 
   They are embedded, or written by a provider that has such an input.
   """
-  found = {n for n in design.ports if design.channel_of(n) == 'embedded'}
+  names = {n for n in design.ports if design.channel_of(n) == 'embedded'}
   for _ in design.providers:  # As many turns as the longest chain may take.
     for provider in design.providers:
-      if found.intersection(specs.inputs_of(provider, design)):
-        found.update(provider.writes)
-  return found
+      if names.intersection(specs.inputs_of(provider, design)):
+        names.update(provider.writes)
+  return names

@@ -114,10 +114,10 @@ class Stakes(validation.Record):
       The relative gain; nan if it is unknown, and `None` if no part has a stake
       that is not degenerate, or without control steps.
     """
-    found = self.relative_gains(objective)
-    if any(map(math.isnan, found)):
+    part_gains = self.relative_gains(objective)
+    if any(map(math.isnan, part_gains)):
       return math.nan
-    return max(found, default=None)
+    return max(part_gains, default=None)
 
   def relative_gains(
       self, objective: Mapping[str, gains.Value], end: str = 'estimate'
@@ -240,7 +240,7 @@ def of_results(reference: Played, judged: Played, key: str = '') -> Stakes:
   names = list(reference.solver[0].objective) if reference.solver else []
   if not names:
     raise errors.ResultsError('no episode of the solver has an objective')
-  found = {}
+  parts = {}
   for name in names:
     stake = _stake(
         {
@@ -249,8 +249,8 @@ def of_results(reference: Played, judged: Played, key: str = '') -> Stakes:
         }
     )
     here = _differences(name, 'observed', judged, stake.than)
-    found[name] = _confirmed(stake, here)
-  return Stakes(key=key, parts=found)
+    parts[name] = _confirmed(stake, here)
+  return Stakes(key=key, parts=parts)
 
 
 def _differences(
@@ -281,8 +281,8 @@ def _confirmed(stake: Stake, here: Sequence[float]) -> Stake:
   """
   low = high = math.nan
   if here:
-    found = stats.quantile_test(here, q=0, p=0.5).confidence_interval(0.95)
-    low, high = float(found.low), float(found.high)
+    interval = stats.quantile_test(here, q=0, p=0.5).confidence_interval(0.95)
+    low, high = float(interval.low), float(interval.high)
   median = Stake(
       estimate=float(np.median(here)) if here else math.nan,
       low=low,
@@ -296,7 +296,7 @@ def _confirmed(stake: Stake, here: Sequence[float]) -> Stake:
 
 def _stake(differences: Mapping[str, Sequence[float]]) -> Stake:
   """Returns the smaller positive of two differences, or else the larger one."""
-  found = []
+  candidates = []
   for than, values in differences.items():
     if len(values) < 2:
       raise errors.ResultsError(
@@ -304,7 +304,7 @@ def _stake(differences: Mapping[str, Sequence[float]]) -> Stake:
           ' at least two are needed'
       )
     interval = intervals.mean_interval({0: values})
-    found.append(
+    candidates.append(
         Stake(
             estimate=interval.estimate,
             low=interval.low,
@@ -312,7 +312,7 @@ def _stake(differences: Mapping[str, Sequence[float]]) -> Stake:
             than=than,
         )
     )
-  positive = [one for one in found if one.estimate > 0]
+  positive = [one for one in candidates if one.estimate > 0]
   if positive:
-    return min(positive, key=lambda one: one.estimate)
-  return max(found, key=lambda one: one.estimate)
+    return min(positive, key=lambda stake: stake.estimate)
+  return max(candidates, key=lambda stake: stake.estimate)
