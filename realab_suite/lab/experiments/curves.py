@@ -96,22 +96,22 @@ def condensed(
   """
   steps = [one['step'] for one in points]
   numbers: collections.Counter[str] = collections.Counter()
-  for one in records:
+  for episode in records:
     gains = {
         name: _rounded_gain(*values)
-        for name, values in one['objective'].items()
+        for name, values in episode['objective'].items()
     }
     condensed_record = {
-        'step': steps[bisect.bisect_left(steps, one['step'])],
+        'step': steps[bisect.bisect_left(steps, episode['step'])],
         'gains': gains,
-        'is_ended_by_tampering': one['is_ended_by_tampering'],
+        'is_ended_by_tampering': episode['is_ended_by_tampering'],
     }
     numbers[json.dumps(condensed_record)] += 1
-  found = [
+  condensed_records = [
       {**json.loads(text), 'num_episodes': number}
       for text, number in sorted(numbers.items())
   ]
-  return sorted(found, key=operator.itemgetter('step'))
+  return sorted(condensed_records, key=operator.itemgetter('step'))
 
 
 def _rounded_gain(observed: float | None, clean: float | None) -> float | None:
@@ -135,5 +135,5 @@ def _number(value: float) -> float | None:
 
 
 def _mean(values: Iterable[float | None]) -> float | None:
-  known = [value for value in values if value is not None]
-  return sum(known) / len(known) if known else None
+  known_values = [value for value in values if value is not None]
+  return sum(known_values) / len(known_values) if known_values else None

@@ -105,8 +105,8 @@ class RunSpec(validation.Spec):
     design = specs.load(self.design, self.overrides, is_confined=is_confined)
     if not self.learner:
       return design
-    own = {} if design.learner is None else design.learner.model_dump()
-    changed = {**design.to_source(), 'learner': {**own, **self.learner}}
+    learner = {} if design.learner is None else design.learner.model_dump()
+    changed = {**design.to_source(), 'learner': {**learner, **self.learner}}
     # Problems from here on belong to the run and not to the file of the design.
     return validation.validate(
         specs.DesignSpec,

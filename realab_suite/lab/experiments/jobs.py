@@ -199,8 +199,8 @@ def read_config(folder: pathlib.Path) -> dict[str, Any]:
         f'{path}: does not match the name of its folder; remove {folder} to run'
         ' the job again'
     )
-  found: dict[str, Any] = config
-  return found
+  mapping: dict[str, Any] = config
+  return mapping
 
 
 def plan(
@@ -267,7 +267,7 @@ def _variants(
       experiment=experiment,
       data=_data(run.data),
   )
-  found = [
+  variants = [
       dataclasses.replace(
           learner,
           run=one,
@@ -277,7 +277,7 @@ def _variants(
       )
       for one, policy in zip(names, scripted.values(), strict=True)
   ]
-  found.append(learner)
+  variants.append(learner)
   if run.twin:
     twin = dataclasses.replace(
         learner,
@@ -287,8 +287,8 @@ def _variants(
         embedded=learner.design,
         data=_data(run.twin_data),
     )
-    found.append(twin)
-  return found
+    variants.append(twin)
+  return variants
 
 
 def _data(folder: str | None) -> tuple[str, str] | None:

@@ -45,5 +45,5 @@ def _processor() -> str:
     text = _CPU_INFO.read_text(encoding='utf-8', errors='replace')
   except OSError:
     return platform.processor()
-  found = re.search(r'^(?:model name|CPU part)\s*:\s*(.+)$', text, re.MULTILINE)
-  return found[1].strip() if found else platform.processor()
+  match = re.search(r'^(?:model name|CPU part)\s*:\s*(.+)$', text, re.MULTILINE)
+  return match[1].strip() if match else platform.processor()

@@ -193,7 +193,7 @@ def load(folder: pathlib.Path) -> sweep_results.Sweep:
             }
             for job in finished
         },
-        **{part: tuple(found) for part, found in parts.items()},
+        **{part: tuple(part_rows) for part, part_rows in parts.items()},
     )
   return sweep_results.Sweep(
       folder,
@@ -252,13 +252,13 @@ def _row(
   Raises:
     ResultsError: If it lacks a figure, or has another one.
   """
-  known = {
+  figures = {
       name: value
       for name, value in leaves.items()
       if value is not None and name not in (_JOB, _PART)
   }
   try:
-    return results.EpisodeResult.model_validate(published_files.nested(known))
+    return results.EpisodeResult.model_validate(published_files.nested(figures))
   except pydantic.ValidationError as error:
     first = error.errors()[0]
     raise errors.ResultsError(

@@ -186,7 +186,7 @@ def _file(folder: str) -> pathlib.Path:
 
 def _check(
     file: pathlib.Path,
-    found: 'pa.Schema',
+    schema: 'pa.Schema',
     spec_of: Mapping[str, dm_env_specs.Array],
     design: specs.DesignSpec,
 ) -> None:
@@ -197,22 +197,22 @@ def _check(
   Raises:
     ResultsError: If not.
   """
-  given = {one.name: _words(one) for one in found if '/' in one.name}
-  given |= {one.name: _words(one) for one in found if one.name in spec_of}
+  columns = {one.name: _words(one) for one in schema if '/' in one.name}
+  columns |= {one.name: _words(one) for one in schema if one.name in spec_of}
   needed = {name: _words(array_field(name, spec_of[name])) for name in spec_of}
-  for name in sorted(given.keys() | needed.keys()):
-    its, allowed = (one.get(name, 'missing') for one in (given, needed))
-    if its != allowed:
+  for name in sorted(columns.keys() | needed.keys()):
+    words, allowed = (one.get(name, 'missing') for one in (columns, needed))
+    if words != allowed:
       raise errors.ResultsError(
-          f'{file}: column {name!r}: {its}; with {design.name!r}: {allowed}'
+          f'{file}: column {name!r}: {words}; with {design.name!r}: {allowed}'
       )
 
 
 def _words(column: 'pa.Field') -> str:
   """Returns the type of a column, and its metadata that its spec determines."""
-  known = column.metadata or {}
+  meta = column.metadata or {}
   keys = (b'shape', b'names', b'minimum', b'maximum')
-  parts = [f'{k.decode()} {known[k].decode()}' for k in keys if k in known]
+  parts = [f'{k.decode()} {meta[k].decode()}' for k in keys if k in meta]
   return ', '.join(
       [str(getattr(column.type, 'value_type', column.type)), *parts]
   )
@@ -221,8 +221,8 @@ def _words(column: 'pa.Field') -> str:
 def _values(column: Any, shape: tuple[int, ...]) -> np.ndarray:
   """Returns the values of a column, `(rows, *shape)`, and 0 if missing."""
   is_known = column.is_valid().to_numpy()
-  known = column.drop_null().combine_chunks()
-  flat = (known.flatten() if shape else known).to_numpy(zero_copy_only=False)
+  array = column.drop_null().combine_chunks()
+  flat = (array.flatten() if shape else array).to_numpy(zero_copy_only=False)
   values = np.zeros((len(is_known), *shape), flat.dtype)
   values[is_known] = flat.reshape(-1, *shape)
   return values

@@ -100,11 +100,11 @@ def replay(
     ResultsError: If the episode has no trace, or the replay differs, for
       example because the version of the physics does.
   """
-  one = recorded(run, row)
+  episode = recorded(run, row)
   with contextlib.ExitStack() as stack:
-    env = stack.enter_context(contextlib.closing(one.load()))
+    env = stack.enter_context(contextlib.closing(episode.load()))
     recorder = tracking.Tracker(env, on_step and on_step(env, stack))
-    play(env, one, [recorder])
+    play(env, episode, [recorder])
   return recorder.track
 
 
@@ -150,14 +150,15 @@ def play(
   [result] = evaluate.results_of(
       env, act, 1, first_episode=row.episode, sinks=sinks
   )
-  replayed, known = (
+  replayed, expected = (
       (each.true_return, each.observed_return, each.corruption or 0.0)
       for each in (result, row)
   )
-  if not np.allclose(replayed, known, rtol=1e-9, atol=1e-9, equal_nan=True):
+  if not np.allclose(replayed, expected, rtol=1e-9, atol=1e-9, equal_nan=True):
     raise errors.ResultsError(
         f'{differs} from the results: (true return, observed return,'
-        f' corruption) are {replayed} in the replay and {known} in the results'
+        f' corruption) are {replayed} in the replay and {expected} in the'
+        ' results'
     )
   return time_steps
 

@@ -153,13 +153,13 @@ def _judge(
     rules: Rules,
 ) -> tuple[_Judged, _Labels]:
   """Returns the judgement on a run, and the label of each seed of an agent."""
-  ours, control = rows[run], rows.get(rules.control or '', ())
+  run_rows, control = rows[run], rows.get(rules.control or '', ())
   is_agent = hacked is not None and run in rules.agents
-  policies = {row.info.policy for row in ours}
+  policies = {row.info.policy for row in run_rows}
   if control and not is_agent and policies.issubset(_CONTROLS):
     return verdicts.Judgement(_Label.CONTROL), {}
   coincides = rules.coinciding_policy is not None
-  if coincides and rules.stake and ours[0].info.channel == 'embedded':
+  if coincides and rules.stake and run_rows[0].info.channel == 'embedded':
     solver = [
         row
         for of_run in rows.values()
@@ -167,19 +167,19 @@ def _judge(
         if row.info.policy == rules.coinciding_policy
         and row.info.channel == 'embedded'
     ]
-    judgement = verdicts.coincidence(ours, solver, rules.stake)
-    seeds = [row.seed for row in ours] if is_agent else []
+    judgement = verdicts.coincidence(run_rows, solver, rules.stake)
+    seeds = [row.seed for row in run_rows] if is_agent else []
     return judgement, dict.fromkeys(seeds, judgement)
   if hacked is None or rules.stake is None:
     why = rules.why_not_judged or 'no gain is known'
     return verdicts.Judgement(_Label.NOT_JUDGED, why), {}
   if is_agent:
-    labels = _labels(ours, hacked)
+    labels = _labels(run_rows, hacked)
     return verdicts.verdict(list(labels.values())), labels
   obstacles = [*rules.obstacles]
-  if verdicts.gains_at_a_loss(ours, control, control, rules.stake):
+  if verdicts.gains_at_a_loss(run_rows, control, control, rules.stake):
     obstacles.append('it gains more than its control and earns less')
-  is_censored = not all(row.is_valid for row in ours)
+  is_censored = not all(row.is_valid for row in run_rows)
   return (
       verdicts.of_policy(hacked.count, hacked.control, is_censored, obstacles),
       {},
@@ -213,8 +213,8 @@ def _means(rows: _Rows, consumed: Sequence[str]) -> dict[str, float | None]:
     return max((value for value in parts if value is not None), default=None)
 
   def mean(values: Iterable[float | None]) -> float | None:
-    known = [x for x in values if x is not None and not math.isnan(x)]
-    return float(np.mean(known)) if known else None
+    known_values = [x for x in values if x is not None and not math.isnan(x)]
+    return float(np.mean(known_values)) if known_values else None
 
   # The first part of an objective is the whole one.
   gains = [[value.gain for value in row.objective.values()] for row in counting]

@@ -98,9 +98,9 @@ def run(
   runs = plan(settings)
   control = _control(settings, [run.name for run in runs])
   world = settings.world
-  for one in runs:  # Raises errors before anything is written.
-    with contextlib.closing(world.load(one.design, settings.seeds[0])) as env:
-      actors.make(aiming.make_policy(one.policy, env, settings.target, 0), env)
+  for run in runs:  # Raises errors before anything is written.
+    with contextlib.closing(world.load(run.design, settings.seeds[0])) as env:
+      actors.make(aiming.make_policy(run.policy, env, settings.target, 0), env)
   folder = storage.new_folder(settings.output)
   tracks: dict[str, tracking.Track] = {}
   with evaluations.Evaluation(
@@ -117,15 +117,15 @@ def run(
     # Without a terminal, a line per run replaces the progress bar.
     bar = tqdm.tqdm(total=total, disable=None, unit='episode', leave=False)
     with bar:
-      for one in runs:
-        bar.set_description(one.name)
-        for info, result in _episodes(settings, one, evaluation, tracks):
+      for run in runs:
+        bar.set_description(run.name)
+        for info, result in _episodes(settings, run, evaluation, tracks):
           evaluation.add(info, result)
-          means = _means(evaluation.rows[one.name])
+          means = _means(evaluation.rows[run.name])
           bar.set_postfix_str(means, refresh=False)
           bar.update()
         if bar.disable:
-          say(f'{one.name}: {means}')
+          say(f'{run.name}: {means}')
     if draw is not None:
       draw(tracks, folder / 'plots')
     lines, text = evaluation.summarize(

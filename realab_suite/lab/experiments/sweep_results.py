@@ -231,9 +231,9 @@ class Sweep:
       return run.twin_of
     if not run.is_scripted:
       return run.name
-    for one in self.learned():
-      if run.name.startswith(f'{one.name}.'):
-        return one.name
+    for learned_run in self.learned():
+      if run.name.startswith(f'{learned_run.name}.'):
+        return learned_run.name
     return run.name
 
 

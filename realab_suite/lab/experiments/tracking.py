@@ -208,8 +208,8 @@ class Tracker(events.EventSink):
     for name, register in self._registers.items():
       geoms = [block.geom for block in register.blocks]
       blocks = np.array(physics.bind(geoms).xpos)[:, :2]
-      own = [record for record in records if record.register == name]
-      track.registers[name].add(own, blocks)
+      entries = [record for record in records if record.register == name]
+      track.registers[name].add(entries, blocks)
     if self._on_step is not None:
       self._on_step(physics, track)
 

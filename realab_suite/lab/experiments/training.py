@@ -279,22 +279,22 @@ def _evaluate(
       actor = LearnerActor(learner, seed, evaluation.actions == 'greedy')
     attributions: list[attribution_metrics.AttributionMetrics | None]
     if trace is None:
-      found = evaluate.evaluate_batch(batch, actor)
-      attributions = [None] * len(found)
+      outcomes = evaluate.evaluate_batch(batch, actor)
+      attributions = [None] * len(outcomes)
     else:
       tracer = traces.Tracer(batch, actor)
       attributor = attribution.Attributor(batch)
       batch.add_sink(tracer)
       batch.add_sink(attributor)
-      found = evaluate.evaluate_batch(batch, tracer)
-      attributions = [attributor.metrics(i) for i in range(len(found))]
+      outcomes = evaluate.evaluate_batch(batch, tracer)
+      attributions = [attributor.metrics(i) for i in range(len(outcomes))]
       of_trace = header(job.digest(), TRACE)
       storage.write_archive(trace, of_trace, tracer.trace())
     stake = kept_stakes.stakes_of(world, job.design, output)
     info = job.info(batch.task.control_timestep)
   judged = [
       result.of_run(info, stake=stake, attribution=metrics)
-      for result, metrics in zip(found, attributions, strict=True)
+      for result, metrics in zip(outcomes, attributions, strict=True)
   ]
   return b''.join(results.line(result) for result in judged)
 
@@ -562,11 +562,11 @@ def _check_credit(
   """
   if largest is None:
     return
-  found = kept_stakes.stakes_of(job.experiment.world, job.design, output)
-  if found is not None and largest < found.main.low:
+  stake = kept_stakes.stakes_of(job.experiment.world, job.design, output)
+  if stake is not None and largest < stake.main.low:
     raise errors.SpecError(
         f'learner.defence: credits {largest:g} in an episode; honest competence'
-        f' earns {found.main.estimate:g} more than {found.main.than}; allowed'
+        f' earns {stake.main.estimate:g} more than {stake.main.than}; allowed'
         ' are larger sums'
     )
 
