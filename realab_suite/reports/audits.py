@@ -44,7 +44,7 @@ def of_run(
   content = sweep.audits[run.name]
   path = f'{sweep.folder}: the audit of run {run.name!r}'
   try:
-    found = _Content.model_validate(content, strict=True)
+    audit = _Content.model_validate(content, strict=True)
   except pydantic.ValidationError as error:
     first = error.errors()[0]
     key = '.'.join(map(str, first['loc'])) or 'contents'
@@ -52,13 +52,13 @@ def of_run(
         f'{path}: {key}: {first["input"]!r:.80}; {first["msg"]}, as in a file'
         ' that the present version of the program audit has written'
     ) from error
-  _check_subject(path, found, run)
+  _check_subject(path, audit, run)
   return verdicts.Audit(
-      is_exploitable=found.verdict == findings.EXPLOITABLE,
+      is_exploitable=audit.verdict == findings.EXPLOITABLE,
       is_sufficient=(
-          found.is_sufficient and found.verdict != findings.UNDECIDED
+          audit.is_sufficient and audit.verdict != findings.UNDECIDED
       ),
-      num_episodes=found.num_searched,
+      num_episodes=audit.num_searched,
   )
 
 
@@ -76,7 +76,7 @@ class _Content(pydantic.BaseModel):
   query_policy: str | None = None
 
 
-def _check_subject(path: str, found: _Content, run: sweep_results.Run) -> None:
+def _check_subject(path: str, audit: _Content, run: sweep_results.Run) -> None:
   """Checks that an audit is of the design and the world of a run.
 
   Settings of the learner that neither change its objective nor its queries are
@@ -89,14 +89,14 @@ def _check_subject(path: str, found: _Content, run: sweep_results.Run) -> None:
   senses = config.get('environment_kwargs', {}).get('senses')
   objective = design.objective and design.objective.model_dump(mode='json')
   audited = {
-      'task': f'{found.world.get("domain")}.{found.world.get("task")}',
-      **{key: found.world.get(key) for key in _OF_WORLD},
-      'target': found.target,
-      **_of_design(found.design),
-      'the objective': found.objective,
-      'the query policy': found.query_policy,
+      'task': f'{audit.world.get("domain")}.{audit.world.get("task")}',
+      **{key: audit.world.get(key) for key in _OF_WORLD},
+      'target': audit.target,
+      **_of_design(audit.design),
+      'the objective': audit.objective,
+      'the query policy': audit.query_policy,
   }
-  ours = {
+  expected = {
       'task': config['task'],
       'max_steps': config['max_steps'],
       'task_kwargs': config.get('task_kwargs', {}),
@@ -106,12 +106,12 @@ def _check_subject(path: str, found: _Content, run: sweep_results.Run) -> None:
       'the objective': objective,
       'the query policy': actors.query_policy(design),
   }
-  for key in {**ours, **audited}:
-    theirs, own = audited.get(key), ours.get(key)
-    if theirs != own:
+  for key in {**expected, **audited}:
+    value, needed = audited.get(key), expected.get(key)
+    if value != needed:
       raise errors.ResultsError(
           f'{path} is of another one: {key} is'
-          f' {theirs!r:.120}, and {own!r:.120} in the run'
+          f' {value!r:.120}, and {needed!r:.120} in the run'
       )
 
 

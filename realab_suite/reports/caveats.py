@@ -39,12 +39,12 @@ def _on_completeness(
         ' not report them as results.'
     )
   if sweep.unfinished:
-    found: dict[str, list[str]] = {}
+    seeds_of_run: dict[str, list[str]] = {}
     for job in sweep.unfinished:
-      found.setdefault(job.run, []).append(str(job.seed))
+      seeds_of_run.setdefault(job.run, []).append(str(job.seed))
     missing = ', '.join(
         f'{name} (seed{"s" if len(seeds) > 1 else ""} {", ".join(seeds)})'
-        for name, seeds in found.items()
+        for name, seeds in seeds_of_run.items()
     )
     yield (
         f'{len(sweep.unfinished)} of'

@@ -191,8 +191,8 @@ def _draw_lane(
   def curve(values: np.ndarray) -> list[tuple[float, float]]:
     share = (values - low) / max(high - low, 1.0)
     y = lowest + share * (highest - lowest)
-    seen = np.isfinite(y)
-    return list(zip(x[seen], y[seen], strict=True))
+    is_finite = np.isfinite(y)
+    return list(zip(x[is_finite], y[is_finite], strict=True))
 
   zero = curve(np.zeros_like(read))[0][1]
   draw.line([(_LABELS, zero), (width - _MARGIN, zero)], fill=(70, 78, 92))

@@ -31,21 +31,21 @@ def headline(
   return {run.name: _lines(sweep, figures, figures[run.name]) for run in runs}
 
 
-def _share(one: numbers.Figures) -> float:
-  labels = [seed.judgement.label for seed in one.seeds.values()]
+def _share(learned: numbers.Figures) -> float:
+  labels = [seed.judgement.label for seed in learned.seeds.values()]
   return sum(label is _Label.TAMPERS for label in labels) / len(labels)
 
 
 def _lines(
     sweep: sweep_results.Sweep,
     figures: Mapping[str, numbers.Figures],
-    one: numbers.Figures,
+    learned: numbers.Figures,
 ) -> list[str]:
-  lines = [_task(sweep, figures, one), _labels(one)]
-  if one.hacking is not None:
-    lines.append(_rate(one.hacking))
-  lines.append(f'Audit: {_audit(one.audit)}.')
-  training = one.training
+  lines = [_task(sweep, figures, learned), _labels(learned)]
+  if learned.hacking is not None:
+    lines.append(_rate(learned.hacking))
+  lines.append(f'Audit: {_audit(learned.audit)}.')
+  training = learned.training
   if training is not None:
     lines.append(
         f'Tampering paid in {training.paid:,} of'
@@ -57,27 +57,27 @@ def _lines(
 def _task(
     sweep: sweep_results.Sweep,
     figures: Mapping[str, numbers.Figures],
-    one: numbers.Figures,
+    learned: numbers.Figures,
 ) -> str:
   """Returns whether an agent fails at the task, beside its secure twin."""
-  text = 'Fails at the task' if one.fails else 'Does the task'
-  if one.fails is None:
+  text = 'Fails at the task' if learned.fails else 'Does the task'
+  if learned.fails is None:
     text = 'May fail at the task'
-  text += f': it earns {_return(one)}'
-  twin = sweep.twin(one.run)
+  text += f': it earns {_return(learned)}'
+  twin = sweep.twin(learned.run)
   if twin is not None and twin.name in figures:
-    its = figures[twin.name]
-    also = ', which fails as well' if one.fails and its.fails else ''
+    secure = figures[twin.name]
+    also = ', which fails as well' if learned.fails and secure.fails else ''
     text += (
-        f', its secure twin {number(its.summary.true_return.estimate)}{also}'
+        f', its secure twin {number(secure.summary.true_return.estimate)}{also}'
     )
-  observed = number(one.summary.observed_return.estimate)
+  observed = number(learned.summary.observed_return.estimate)
   return f'{text}. It observes {observed}.'
 
 
-def _labels(one: numbers.Figures) -> str:
+def _labels(learned: numbers.Figures) -> str:
   """Returns the label, in how many seeds, and the verdict if there is one."""
-  judgements = [seed.judgement for seed in one.seeds.values()]
+  judgements = [seed.judgement for seed in learned.seeds.values()]
   number_of = len(judgements)
   for label in (_Label.TAMPERS, _Label.DOES_NOT_TAMPER):
     count = sum(judgement.label is label for judgement in judgements)
@@ -92,25 +92,25 @@ def _labels(one: numbers.Figures) -> str:
       text = f'{first} in all {number_of} seeds:{reason}'
   if judgements[0].label is _Label.COINCIDES:
     return f'{text}.'
-  if one.verdict is None or number_of < verdicts.FEWEST_SEEDS:
+  if learned.verdict is None or number_of < verdicts.FEWEST_SEEDS:
     return f'{text}; {verdicts.needed_seeds(number_of)}.'
-  return f'{text}. Verdict: {one.verdict.words}.'
+  return f'{text}. Verdict: {learned.verdict.words}.'
 
 
 def _capital(text: str) -> str:
   return text[:1].upper() + text[1:]
 
 
-def _rate(found: hacking.Hacking) -> str:
+def _rate(figures: hacking.Hacking) -> str:
   # The unit stands before the interval: '80 % [0, 100]'.
-  rate, *interval = tables.text(found.rate.scaled(100)).split(maxsplit=1)
-  beside = tables.text(100 * found.control.count.rate)
+  rate, *interval = tables.text(figures.rate.scaled(100)).split(maxsplit=1)
+  control_rate = tables.text(100 * figures.control.count.rate)
   text = ' '.join([f'Hack rate {rate} %', *interval])
-  text += f', beside {beside} % of {found.control.name}'
-  if found.count.ended:
+  text += f', beside {control_rate} % of {figures.control.name}'
+  if figures.count.ended:
     text += (
-        f'; only a corrupted signal ended {found.count.ended} of'
-        f' {found.count.episodes} episodes'
+        f'; only a corrupted signal ended {figures.count.ended} of'
+        f' {figures.count.episodes} episodes'
     )
   return f'{text}.'
 
@@ -124,12 +124,12 @@ def _audit(audit: verdicts.Audit | None) -> str:
   return f'resisted {audit.num_episodes:,} episodes{small}'
 
 
-def _return(one: numbers.Figures) -> str:
+def _return(learned: numbers.Figures) -> str:
   """Returns the true return of a run, with the largest possible one."""
-  interval: intervals.Interval = one.summary.true_return
+  interval: intervals.Interval = learned.summary.true_return
   largest = interval.bounds[1]
   of = '' if largest is None else f' of {largest:g}'
-  least = 'at least ' if one.summary.num_given_up else ''
+  least = 'at least ' if learned.summary.num_given_up else ''
   return f'{least}{number(interval.estimate)}{of}'
 
 

@@ -187,12 +187,12 @@ def _coverage(counting: _Rows) -> float | None:
 
 
 def _training(seeds: Collection[Seed]) -> verdicts.Training | None:
-  known = [seed.training for seed in seeds if seed.training]
-  if not known:
+  trainings = [seed.training for seed in seeds if seed.training]
+  if not trainings:
     return None
   return verdicts.Training(
-      sum(training.paid for training in known),
-      sum(training.episodes for training in known),
+      sum(training.paid for training in trainings),
+      sum(training.episodes for training in trainings),
   )
 
 
@@ -392,14 +392,14 @@ def _fails(
 
 def solver_rows(sweep: sweep_results.Sweep, run: sweep_results.Run) -> _Rows:
   """Returns the episodes of the solver in the design of a run."""
-  for one in sweep.runs.values():
+  for candidate in sweep.runs.values():
     if (
-        one.is_scripted
-        and one.rows
-        and sweep.family(one) == sweep.family(run)
-        and one.rows[0].info.policy == run.world.solver
+        candidate.is_scripted
+        and candidate.rows
+        and sweep.family(candidate) == sweep.family(run)
+        and candidate.rows[0].info.policy == run.world.solver
     ):
-      return one.rows
+      return candidate.rows
   return ()
 
 
@@ -470,9 +470,9 @@ def _intervals(
   frame.index = [row.seed for row in rows]
   return {
       name: intervals.mean_interval(
-          {seed: list(values) for seed, values in known.groupby(level=0)},
-          bounds=bounds(known),
+          {seed: list(values) for seed, values in series.groupby(level=0)},
+          bounds=bounds(series),
       )
       for name in frame
-      if len(known := frame[name].dropna())
+      if len(series := frame[name].dropna())
   }

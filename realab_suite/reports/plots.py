@@ -168,13 +168,13 @@ def curve(
   for step, *_ in points:
     if step - (ends[-1] if ends else 0) >= width:
       ends.append(step)
-  known = [(s, n, value) for s, n, value in points if n and value is not None]
-  if known and (not ends or ends[-1] < known[-1][0]):
+  entries = [(s, n, value) for s, n, value in points if n and value is not None]
+  if entries and (not ends or ends[-1] < entries[-1][0]):
     ends[-1:] = [points[-1][0]]
   means = {}
   for begin, end in zip([0, *ends], ends, strict=False):
-    counts = [n for s, n, _ in known if begin < s <= end]
-    values = [value for s, _, value in known if begin < s <= end]
+    counts = [n for s, n, _ in entries if begin < s <= end]
+    values = [value for s, _, value in entries if begin < s <= end]
     if sum(counts) >= fewest:
       means[end] = float(np.average(values, weights=counts))
   return means
@@ -210,11 +210,11 @@ def band(
     curves: Values by the number of control steps, for each seed.
     bounds: Bounds of the possible values.
   """
-  known = {seed: c for seed, c in curves.items() if c}
+  seed_curves = {seed: c for seed, c in curves.items() if c}
   rows = []
-  for step in sorted({step for c in known.values() for step in c}):
-    if all(step in c or max(c) < step for c in known.values()):
-      values = {seed: [c[step]] for seed, c in known.items() if step in c}
+  for step in sorted({step for c in seed_curves.values() for step in c}):
+    if all(step in c or max(c) < step for c in seed_curves.values()):
+      values = {seed: [c[step]] for seed, c in seed_curves.items() if step in c}
       mean = intervals.mean_interval(values, bounds=bounds)
       rows.append([step, mean.estimate, mean.low, mean.high])
   return Band(*np.array(rows, float).reshape(-1, 4).T)
@@ -260,7 +260,7 @@ def learning(
   ]
   if not rows:
     return None
-  every: list[Band] = []
+  bands: list[Band] = []
   with matplotlib.rc_context(STYLE):
     size = _WIDTH, len(rows) * _ROW + 0.6
     canvas, axes = _subplots(
@@ -272,10 +272,10 @@ def learning(
       colour = run_colours[name]
       for i, (_, key, _) in enumerate(_COLUMNS):
         for run in runs:
-          one = _band(run, key)
-          _draw_band(row[i], one, colour, is_twin=run.twin_of is not None)
-          largest[i] = max([largest[i], *np.abs(one.mean)])
-          every.append(one)
+          line = _band(run, key)
+          _draw_band(row[i], line, colour, is_twin=run.twin_of is not None)
+          largest[i] = max([largest[i], *np.abs(line.mean)])
+          bands.append(line)
       baseline = figures.get(runs[0].baseline or '')
       if baseline is not None:
         row[0].axhline(
@@ -311,7 +311,7 @@ def learning(
     if any('adaptation' in runs[0].config['training'] for runs in rows):
       handles.append(_handle('adaptation begins', color=_GREY, ls='-.'))
     # A single seed has no interval.
-    if any(np.isfinite(one.low).any() for one in every):
+    if any(np.isfinite(one.low).any() for one in bands):
       label = '95 % interval over seeds'
       handles.append(patches.Patch(color=_INK, alpha=0.15, label=label))
     _add_legend(canvas, handles)
@@ -323,12 +323,12 @@ def _band(run: sweep_results.Run, key: str) -> Band:
 
   def value(point: Mapping[str, Any]) -> float | None:
     """Returns a figure of a point, with gains in units of the stake."""
-    found, stake = point[key], run.stake
-    if key != 'gain' or found is None:
-      return found
+    number, stake = point[key], run.stake
+    if key != 'gain' or number is None:
+      return number
     if stake is None or stake.main.is_degenerate:
       return None
-    return float(found) / stake.main.estimate
+    return float(number) / stake.main.estimate
 
   # All worlds begin together, so at first their episodes also end together.
   # The reset takes one step more.
@@ -355,14 +355,14 @@ def _band(run: sweep_results.Run, key: str) -> Band:
   return band(curves, bounds)
 
 
-def _draw_band(ax: Any, one: Band, colour: str, *, is_twin: bool) -> None:
-  known = np.isfinite(one.low)
+def _draw_band(ax: Any, line: Band, colour: str, *, is_twin: bool) -> None:
+  is_known = np.isfinite(line.low)
   ax.fill_between(
-      one.steps[known], one.low[known], one.high[known], color=colour,
-      alpha=0.08 if is_twin else 0.18, linewidth=0,
+      line.steps[is_known], line.low[is_known], line.high[is_known],
+      color=colour, alpha=0.08 if is_twin else 0.18, linewidth=0,
   )  # fmt: skip
   ax.plot(
-      one.steps, one.mean, color=colour, linewidth=1.5,
+      line.steps, line.mean, color=colour, linewidth=1.5,
       linestyle='--' if is_twin else '-',
   )  # fmt: skip
 

@@ -123,10 +123,10 @@ class Scorecard:
   @property
   def columns(self) -> dict[str, dict[str, Cell]]:
     """Cells of each column by world."""
-    found: dict[str, dict[str, Cell]] = {}
+    by_column: dict[str, dict[str, Cell]] = {}
     for (world, column), cell in self.cells.items():
-      found.setdefault(column, {})[world] = cell
-    return found
+      by_column.setdefault(column, {})[world] = cell
+    return by_column
 
   def aggregates(self, column: str, figure: str) -> Any:
     """Returns the aggregates of a column over the cells that count.
@@ -182,9 +182,9 @@ def make(folders: Sequence[pathlib.Path]) -> Scorecard:
   """
   actors: list[_Actor] = []
   notes: list[str] = []
-  known = collections.Counter(folder.resolve() for folder in folders)
+  folder_counts = collections.Counter(folder.resolve() for folder in folders)
   for folder in folders:
-    if known[folder.resolve()] > 1:
+    if folder_counts[folder.resolve()] > 1:
       raise errors.ResultsError(f'{folder}: given twice; must be given once')
     if sweep_results.is_sweep(folder):
       sweep = sweep_results.load(folder)
@@ -199,7 +199,7 @@ def make(folders: Sequence[pathlib.Path]) -> Scorecard:
   cells: dict[_Place, Cell] = {}
   sources: dict[_Place, str] = {}
   differing: dict[str, dict[str, list[str]]] = collections.defaultdict(dict)
-  for actor in sorted(actors, key=lambda one: one.role):  # Learned ones first.
+  for actor in sorted(actors, key=lambda x: x.role):  # Learned ones first.
     place = _name(actor.world), actor.column
     if actor.role not in ('learned', 'scripted'):
       continue
@@ -231,21 +231,21 @@ def _version(actors: Iterable[_Actor]) -> tuple[str, list[str]]:
   Raises:
     ResultsError: If the rows are of different dynamics.
   """
-  found: dict[str, dict[tuple[Any, ...], str]] = {}
+  by_world: dict[str, dict[tuple[Any, ...], str]] = {}
   packages = set()
   for actor in actors:
     for row in actor.rows:
       info = row.info
       dynamics = info.dynamics_version, info.dynamics_digest, info.max_steps
-      found.setdefault(_name(actor.world), {})[dynamics] = actor.source
+      by_world.setdefault(_name(actor.world), {})[dynamics] = actor.source
       packages.add(info.versions.get('realab_suite', 'unknown'))
   former, kinds = [], []
-  for world, sources in sorted(found.items()):
+  for world, sources in sorted(by_world.items()):
     (dynamics, source), *others = sources.items()
-    for other, its in others:
+    for other_dynamics, folder in others:
       raise errors.ResultsError(
-          f'{its}: {world} has (version, digest, max_steps) of dynamics'
-          f' {other}, and {dynamics} in {source}; they must be equal'
+          f'{folder}: {world} has (version, digest, max_steps) of dynamics'
+          f' {other_dynamics}, and {dynamics} in {source}; they must be equal'
       )
     kinds.append([world, *dynamics[:2]])
     installed = suite.dynamics(*world.split('.'))
@@ -253,7 +253,7 @@ def _version(actors: Iterable[_Actor]) -> tuple[str, list[str]]:
       former.append(
           f'{world}: rows of dynamics {dynamics[:2]}, installed is {installed}'
       )
-  if former and len(former) < len(found):
+  if former and len(former) < len(by_world):
     raise errors.ResultsError(
         f'{former[0]}; other worlds have rows of the installed dynamics; all'
         ' must be of one version of the suite'
@@ -269,19 +269,19 @@ def _cell(actor: _Actor, actors: Iterable[_Actor]) -> Cell:
   """Returns the cell of an actor."""
   if not actor.rows:
     return Cell(actor.run, {}, {}, (), {Why.MISSING: ''})
-  beside: dict[str, list[_Actor]] = collections.defaultdict(list)
+  by_role: dict[str, list[_Actor]] = collections.defaultdict(list)
   # What the folder of the actor has comes first.
-  for one in sorted(actors, key=lambda one: one.source != actor.source):
-    if one.key == actor.key:
-      beside[one.role].append(one)
+  for candidate in sorted(actors, key=lambda x: x.source != actor.source):
+    if candidate.key == actor.key:
+      by_role[candidate.role].append(candidate)
   solver, random = (
-      beside[role][0].rows if beside[role] else ()
+      by_role[role][0].rows if by_role[role] else ()
       for role in ('solver', 'random')
   )
   earned = [row.true_return for row in solver if row.counts]
   best = actor.world.best_mean_return
   saboteurs, twins = (
-      [(x.run, x.hacked) for x in beside[role] if x.hacked and not x.objection]
+      [(x.run, x.hacked) for x in by_role[role] if x.hacked and not x.objection]
       for role in ('scripted', 'twin')
   )
   unclean = sum(one.count.most + one.count.unknown for _, one in twins)
@@ -320,8 +320,8 @@ def _cell(actor: _Actor, actors: Iterable[_Actor]) -> Cell:
 def _key(world: worlds.World, design: specs.DesignSpec) -> str:
   kept = {k: v for k, v in design.to_mapping().items() if k not in _FREE}
   # A discount adds a part to the objective, and changes no other.
-  one = design.objective
-  kept['objective'] = one and (one.kind, one.registers)
+  objective = design.objective
+  kept['objective'] = objective and (objective.kind, objective.registers)
   return validation.digest_of({**dataclasses.asdict(world), 'design': kept})
 
 
@@ -381,7 +381,7 @@ def _of_sweep(sweep: sweep_results.Sweep) -> list[_Actor]:
       ]
       design = _of_design(run.design, domain, settings)
       learned = figures[run.name]
-      actors += (_of_run(sweep, learned, own, design) for own in family)
+      actors += (_of_run(sweep, learned, member, design) for member in family)
     else:
       column = run.jobs[0].design
       column = OWN_DESIGN if column == domain else column
@@ -393,7 +393,7 @@ def _of_sweep(sweep: sweep_results.Sweep) -> list[_Actor]:
 def _of_run(
     sweep: sweep_results.Sweep,
     learned: numbers.Figures,
-    own: numbers.Figures,
+    member: numbers.Figures,
     design: tuple[str, str],
 ) -> _Actor:
   """Returns a learner, its twin or a scripted policy in its design.
@@ -401,24 +401,24 @@ def _of_run(
   Args:
     sweep: The sweep.
     learned: Figures of the learner.
-    own: Figures of what acts.
+    member: Figures of what acts.
     design: Column of the design, and what it is.
   """
-  world, kind = learned.run.world, own.run.jobs[0].kind
+  world, kind = learned.run.world, member.run.jobs[0].kind
   column, changes = design
-  role = 'twin' if own.run.twin_of else 'learned'
+  role = 'twin' if member.run.twin_of else 'learned'
   labels = [seed.judgement for seed in learned.seeds.values()]
-  if own.run.is_scripted:
+  if member.run.is_scripted:
     role, column = _role(world, kind), kind
-    if own.hacking is not None and labels[0].label is not _Label.COINCIDES:
-      tampers = verdicts.exceeds(own.hacking.count, own.hacking.control)
+    if member.hacking is not None and labels[0].label is not _Label.COINCIDES:
+      tampers = verdicts.exceeds(member.hacking.count, member.hacking.control)
       label = _Label.TAMPERS if tampers else _Label.UNCLEAR
       labels = [verdicts.Judgement(label)]
   objection = ''
   # Transplants are controls without a run.
-  if own.hacking and own.hacking.control.name in sweep.runs:
-    control = sweep.runs[own.hacking.control.name]
-    objection = _objection(own.hacking, control.jobs[0].kind, world)
+  if member.hacking and member.hacking.control.name in sweep.runs:
+    control = sweep.runs[member.hacking.control.name]
+    objection = _objection(member.hacking, control.jobs[0].kind, world)
   return _Actor(
       str(sweep.folder),
       world,
@@ -426,9 +426,9 @@ def _of_run(
       role,
       column,
       changes,
-      own.run.name,
-      own.run.rows,
-      own.hacking,
+      member.run.name,
+      member.run.rows,
+      member.hacking,
       labels,
       objection,
   )
