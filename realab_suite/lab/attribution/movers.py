@@ -198,8 +198,8 @@ class Movers:
     """
     bodies = np.where(geoms < 0, -1, self._of_geom[geoms])
     rows = bodies.reshape(len(self._is_agents), -1)
-    found = np.take_along_axis(self._is_agents, rows, axis=-1)
-    return (found & (rows >= 0)).reshape(geoms.shape)
+    is_moved = np.take_along_axis(self._is_agents, rows, axis=-1)
+    return (is_moved & (rows >= 0)).reshape(geoms.shape)
 
   def begin(self, where: np.ndarray) -> None:
     """Begins episodes in some worlds, `(worlds,)` bool."""
@@ -304,13 +304,13 @@ class Movers:
       mujoco.mj_comVel(scene, data)
       mujoco.mj_collision(scene, data)
       pairs = self._of_geom[data.contact.geom].tolist()
-      found = [*zip(pairs, data.contact.dist.tolist(), strict=True)]
+      contacts = [*zip(pairs, data.contact.dist.tolist(), strict=True)]
       for body in np.flatnonzero(moment.is_held[world]).tolist():
-        found.append(([body, self._avatar], -math.inf))
-      for pair, gap in found:
-        for one, other in (pair, reversed(pair)):
-          near = gaps.setdefault(one, {})
-          near[other] = min(gap, near.get(other, gap))
+        contacts.append(([body, self._avatar], -math.inf))
+      for pair, gap in contacts:
+        for first, second in (pair, reversed(pair)):
+          near = gaps.setdefault(first, {})
+          near[second] = min(gap, near.get(second, gap))
       centres = data.subtree_com[self._roots]
       ways = centres - centres[:, np.newaxis]
       lengths = np.linalg.norm(ways, axis=-1) + np.eye(len(centres))
@@ -381,22 +381,22 @@ class Movers:
     touching = ring = [body]
     while ring:
       sources, following = [], []
-      for one in ring:
-        for other, gap in scene.gaps.get(one, {}).items():
-          back, forth = scene.approach[one][other], scene.approach[other][one]
+      for link in ring:
+        for peer, gap in scene.gaps.get(link, {}).items():
+          back, forth = scene.approach[link][peer], scene.approach[peer][link]
           path = time * (max(back, 0.0) + max(forth, 0.0))
-          if other in touching or gap > _TOUCH + path:
+          if peer in touching or gap > _TOUCH + path:
             continue
           # A hand always pulls.
           speed = forth if gap > -math.inf else math.inf
-          force = self._masses[other] * speed
-          if is_source[one] and force <= self._masses[one] * back:
+          force = self._masses[peer] * speed
+          if is_source[link] and force <= self._masses[link] * back:
             continue  # It is not pushed, but pushes.
-          if not is_source[other]:
-            following.append(other)
+          if not is_source[peer]:
+            following.append(peer)
           elif speed >= least:
             # If several push, most of the motion is due to the strongest.
-            sources.append((force, bool(is_agents[other]), other))
+            sources.append((force, bool(is_agents[peer]), peer))
       if sources:
         return max(sources)[-1], touching
       ring = list(dict.fromkeys(following))

@@ -56,8 +56,8 @@ class Target(NamedTuple):
   def block_in(self, env: Any) -> block_kinds.Block:
     """Returns the block in an environment with one world or a batch."""
     blocks = env.mechanism.registers[self.register].blocks
-    found: block_kinds.Block = blocks[self.number]
-    return found
+    block: block_kinds.Block = blocks[self.number]
+    return block
 
 
 def attacked(design: specs.DesignSpec, target: str | None = None) -> list[str]:
@@ -122,7 +122,7 @@ def _targets_of(
     register: registers.Register, physics: protocols.Physics
 ) -> list[Target]:
   kinds = appearance.class_of_geoms(physics.model)
-  found = []
+  block_targets = []
   for i, block in enumerate(register.blocks):
     geom = physics.bind(block.geom)
     rotation = np.reshape(geom.xmat, (3, 3))
@@ -134,7 +134,7 @@ def _targets_of(
     code = int(kinds[np.ravel(geom.element_id)[0]])
     turns = (0.0, 1.0) if block.direction else (0.0, 0.5, 1.0, 1.5)
     angles = [frame + np.arctan2(y, x) + turn * np.pi for turn in turns]
-    found.append(
+    block_targets.append(
         Target(
             register.name,
             i,
@@ -143,7 +143,7 @@ def _targets_of(
             tuple(float(np.mod(angle, 2 * np.pi)) for angle in angles),
         )
     )
-  return found
+  return block_targets
 
 
 def positions(

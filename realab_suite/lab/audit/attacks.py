@@ -112,9 +112,9 @@ class CrossEntropy:
     )
 
 
-def _shares(old: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+def _shares(old: np.ndarray, choices: np.ndarray) -> np.ndarray:
   """Returns the updated probabilities of choices, `(macros, choices)`."""
-  counts = (chosen[..., np.newaxis] == np.arange(old.shape[-1])).mean(axis=0)
+  counts = (choices[..., np.newaxis] == np.arange(old.shape[-1])).mean(axis=0)
   shares = np.maximum(_KEPT * old + (1 - _KEPT) * counts, _LEAST_SHARE)
   return np.asarray(shares / shares.sum(axis=-1, keepdims=True))
 

@@ -154,11 +154,11 @@ class Auditor:
           self._searched,
       )
       for trial in search.promising():
-        found = self._compare(trial.plan, stake)
-        if found.is_exploit:
-          return self._result(found)
-        if closest is None or found.count.rate > closest.count.rate:
-          closest = found
+        comparison = self._compare(trial.plan, stake)
+        if comparison.is_exploit:
+          return self._result(comparison)
+        if closest is None or comparison.count.rate > closest.count.rate:
+          closest = comparison
       return self._result(closest or self._compare(search.best.plan, stake))
 
   @contextlib.contextmanager
@@ -190,9 +190,9 @@ class Auditor:
     If it hacks some of them, but too few to be sure, it is compared in more
     worlds: a gain that is rare counts as well.
     """
-    found = self._compare_in(_WORLDS, plan, stake)
-    if found.count.hacked < _LEAST_HACKED or found.is_exploit:
-      return found
+    comparison = self._compare_in(_WORLDS, plan, stake)
+    if comparison.count.hacked < _LEAST_HACKED or comparison.is_exploit:
+      return comparison
     return self._compare_in(_MORE_WORLDS, plan, stake)
 
   def _compare_in(
@@ -211,28 +211,28 @@ class Auditor:
       watch = episodes.Watch(batch, self._targets)
       batch.add_sink(watch)
       played = player.play([plan] * num_worlds)
-    own = [one for one in played if one.counts]
-    self._num_failed += len(played) - len(own)
+    counting = [one for one in played if one.counts]
+    self._num_failed += len(played) - len(counting)
     control = hacking.control(self._solver, solver, stake)
-    if control is None or not own:
+    if control is None or not counting:
       raise errors.ResultsError(
           f'a comparison in {num_worlds} worlds has no figures: the physics of'
           ' all of them failed, or no gain of the solver is known'
       )
-    count = hacking.count(own, stake, control.limit)
+    count = hacking.count(counting, stake, control.limit)
     return findings.Comparison(
-        plan, seed, own, solver, stake, watch, control, count
+        plan, seed, counting, solver, stake, watch, control, count
     )
 
-  def _result(self, found: findings.Comparison) -> findings.Audit:
+  def _result(self, comparison: findings.Comparison) -> findings.Audit:
     obstacles = judging.obstacles_of(
-        self._settings.world, self._settings.design, found.stake
+        self._settings.world, self._settings.design, comparison.stake
     )
     if failed := self._num_failed + self._num_failed_in_search:
       number = intervals.counted(failed, 'episode')
       obstacles.append(f'{number} of plans failed, and show nothing')
     return findings.Audit.of(
-        found,
+        comparison,
         self._targets,
         solver=self._solver,
         design=self._settings.design,

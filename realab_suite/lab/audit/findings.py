@@ -133,8 +133,8 @@ def _gains(
     episodes: Sequence[results.EpisodeResult], stake: stakes.Stakes
 ) -> list[float]:
   """Returns the relative gain of each episode, 0 where it is unknown."""
-  found = [stake.relative_gain(one.objective) or 0.0 for one in episodes]
-  return [0.0 if math.isnan(gain) else gain for gain in found]
+  gains = [stake.relative_gain(one.objective) or 0.0 for one in episodes]
+  return [0.0 if math.isnan(gain) else gain for gain in gains]
 
 
 @final
@@ -231,21 +231,24 @@ class Audit(validation.Record):
     return self.verdict == EXPLOITABLE
 
 
-def _doubts(found: Comparison) -> list[str]:
+def _doubts(comparison: Comparison) -> list[str]:
   """Returns reasons why a comparison without an exploit shows nothing."""
   doubts = []
-  if found.control.share_that_gains > hacking.LARGEST_CONTROL_SHARE:
-    share = intervals.percent(found.control.share_that_gains)
+  if comparison.control.share_that_gains > hacking.LARGEST_CONTROL_SHARE:
+    share = intervals.percent(comparison.control.share_that_gains)
     doubts.append(f'the solver gains in {share} of its own episodes')
-  if found.count.unknown:
-    number = intervals.counted(found.count.unknown, 'episode')
+  if comparison.count.unknown:
+    number = intervals.counted(comparison.count.unknown, 'episode')
     doubts.append(f'the gain of {number} of the plan is unknown')
   if verdicts.gains_at_a_loss(
-      found.own, found.solver, found.solver, found.stake
+      comparison.own, comparison.solver, comparison.solver, comparison.stake
   ):
     doubts.append('the plan gains more than the solver and earns less')
-  if found.count.harmed > found.control.count.harmed + found.count.episodes / 5:
-    number = intervals.counted(found.count.harmed, 'episode')
+  if (
+      comparison.count.harmed
+      > comparison.control.count.harmed + comparison.count.episodes / 5
+  ):
+    number = intervals.counted(comparison.count.harmed, 'episode')
     doubts.append(
         f'corruption takes from {number} of the plan, so clean contents may be'
         ' wrong'
@@ -269,15 +272,16 @@ def _moved(
   )
 
 
-def _typical(found: Comparison) -> int:
+def _typical(comparison: Comparison) -> int:
   """Returns the world with the median gain, of the hacked ones if any is."""
+  stake, limit = comparison.stake, comparison.control.limit
 
-  def is_hacked(one: results.EpisodeResult) -> bool:
-    return bool(hacking.count([one], found.stake, found.control.limit).hacked)
+  def is_hacked(row: results.EpisodeResult) -> bool:
+    return bool(hacking.count([row], stake, limit).hacked)
 
-  some = [one for one in found.own if is_hacked(one)] or found.own
-  order = np.argsort(_gains(some, found.stake), kind='stable')
-  return some[order[len(order) // 2]].world
+  rows = [one for one in comparison.own if is_hacked(one)] or comparison.own
+  order = np.argsort(_gains(rows, stake), kind='stable')
+  return rows[order[len(order) // 2]].world
 
 
 def words(found: Audit, command: str) -> str:
@@ -350,14 +354,14 @@ def _text(interval: intervals.Interval) -> str:
   return str(interval)
 
 
-def _advice(found: Audit) -> str:
+def _advice(audit: Audit) -> str:
   """Returns advice on the next step."""
-  if not found.is_exploitable:
-    if found.verdict == UNDECIDED:
+  if not audit.is_exploitable:
+    if audit.verdict == UNDECIDED:
       return 'No exploit was found, but the figures may not show one.'
-    if not found.registers:
+    if not audit.registers:
       return 'Nothing can move the registers.'
-    if found.is_sufficient:
+    if audit.is_sufficient:
       return (
           'The budget is sufficient; a larger one, or another search, may still'
           ' find an exploit.'
@@ -366,7 +370,7 @@ def _advice(found: Audit) -> str:
         'This is not sufficient for a favourable judgement; leave out --budget'
         ' and --target.'
     )
-  register = [*(one.target for one in found.moved), *found.registers][0]
+  register = [*(one.target for one in audit.moved), *audit.registers][0]
   return (
       'What usually helps: a task in which registers are out of reach, or'
       f' another place, as with --set=registers.{register}.place=[x, y].'

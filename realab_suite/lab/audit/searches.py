@@ -114,11 +114,11 @@ class Search:
     tries = [plan for plan in plans for _ in range(num_worlds)]
     episodes: list[results.EpisodeResult] = []
     for first in range(0, len(tries), self._player.num_envs):
-      some = tries[first : first + self._player.num_envs]
-      played = self._player.play(some)
+      chunk = tries[first : first + self._player.num_envs]
+      played = self._player.play(chunk)
       episodes += played
       self._num_failed += sum(not one.counts for one in played)
-      self._count(len(some))
+      self._count(len(chunk))
     trials = [
         self._trial(plan, episodes[i * num_worlds : (i + 1) * num_worlds])
         for i, plan in enumerate(plans)
