@@ -49,8 +49,8 @@ class Controls:
     """
     if isinstance(spec, specs.DiscreteArray):
       bounds = np.zeros(()), np.array(spec.num_values - 1.0)
-      known = _action_set(spec.name or '')
-      return cls((), spec.dtype, (), spec.num_values, known, *bounds)
+      actions = _action_set(spec.name or '')
+      return cls((), spec.dtype, (), spec.num_values, actions, *bounds)
     if spec.shape[1:] or not spec.shape or spec.dtype.kind not in 'if':
       raise errors.SpecError(
           f'action_spec: {spec!r:.120}; must be a DiscreteArray or a'
@@ -64,11 +64,11 @@ class Controls:
     if isinstance(spec, specs.BoundedArray):
       low = np.array(np.broadcast_to(spec.minimum, spec.shape), float)
       high = np.array(np.broadcast_to(spec.maximum, spec.shape), float)
-    known = None
+    actions = None
     if len(queries) + 1 == spec.shape[0]:
-      known = _action_set(names[-1])
-    num_actions = None if known is None else len(known)
-    return cls(spec.shape, spec.dtype, queries, num_actions, known, low, high)
+      actions = _action_set(names[-1])
+    num_actions = None if actions is None else len(actions)
+    return cls(spec.shape, spec.dtype, queries, num_actions, actions, low, high)
 
   @property
   def size(self) -> int:

@@ -364,8 +364,8 @@ def policy_objective(
     clip: Largest change of a probability ratio in one update.
     floor: Probability below which an action is not made less likely.
   """
-  chosen = jax.nn.one_hot(asked, log_probs.shape[-1])
-  log_prob = jnp.sum(chosen * log_probs[..., jnp.newaxis, :], axis=-1)
+  one_hot = jax.nn.one_hot(asked, log_probs.shape[-1])
+  log_prob = jnp.sum(one_hot * log_probs[..., jnp.newaxis, :], axis=-1)
   signed = advantage[..., jnp.newaxis] * _signs(asked)
   if floor:
     is_rare = old_log_prob < jnp.log(floor)
@@ -409,8 +409,8 @@ def _value_loss(
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
   """Returns the squared error of the predicted feedback, and metrics."""
   values = agent['values'](data['encoded'])
-  chosen = jax.nn.one_hot(data['asked'], values.shape[-1])
-  predicted = jnp.sum(chosen * values[..., jnp.newaxis, :], axis=-1)
+  one_hot = jax.nn.one_hot(data['asked'], values.shape[-1])
+  predicted = jnp.sum(one_hot * values[..., jnp.newaxis, :], axis=-1)
   predicted = jnp.sum(predicted * _signs(data['asked']), axis=-1)
   predicted += _offset(agent, data)
   error = predicted - data['feedback']

@@ -242,8 +242,8 @@ def _partner(
   if not name.endswith(_CLASSES) or not isinstance(spec, specs.BoundedArray):
     return None
   partner = name.removesuffix(_CLASSES) + _DISTANCES
-  other = observation_spec.get(partner)
-  return partner if other is not None and other.shape == spec.shape else None
+  array = observation_spec.get(partner)
+  return partner if array is not None and array.shape == spec.shape else None
 
 
 def _entry(

@@ -212,9 +212,9 @@ class Gatekeeper(base.Wrapper):
     if state['is_trying']:
       learner, trained = self._learner, state['convinced']
       rate = learner.exploration
-      other = learner.action_of(trained, observation, rate, key)
+      trial_action = learner.action_of(trained, observation, rate, key)
       action = choice['action'].copy()
-      action[1::2] = other[1::2]
+      action[1::2] = trial_action[1::2]
       return {**choice, 'action': action}
     if self._trusted is not None and not state['is_open']:
       return self._trusted.steer(choice, time_step, key)

@@ -98,9 +98,9 @@ class Guard(base.Wrapper):
     """
     key = base.folded(self._learner.update_key(), 1)
     observation, hidden = batch['observation'], self._hidden
-    seen = {name: x for name, x in observation.items() if name not in hidden}
+    visible = {name: x for name, x in observation.items() if name not in hidden}
     entries = {name: x for name, x in batch.items() if name not in hidden}
-    shown = jax.tree.map(_read_only, {**entries, 'observation': seen})
+    shown = jax.tree.map(_read_only, {**entries, 'observation': visible})
     try:
       result = self._defence.treat(shown, self._setting, self._state, key)
     except KeyError as error:
@@ -108,7 +108,7 @@ class Guard(base.Wrapper):
         raise
       raise errors.SpecError(
           f'learner.defence {self._defence.kind!r}: takes {error} from a'
-          f' batch; must be one of {sorted(seen)}, or the reading of a'
+          f' batch; must be one of {sorted(visible)}, or the reading of a'
           ' register that `reads` or `pays` names'
       ) from error
     if not isinstance(result, defences.Treated):

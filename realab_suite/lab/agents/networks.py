@@ -188,8 +188,8 @@ class Categorical(eqx.Module):
     """Returns the log-probability of the given actions, `(...)`."""
     log_probs = jax.nn.log_softmax(self.logits)
     # Use a sum over actions, because the gradient of a gather is slow.
-    chosen = jax.nn.one_hot(action, self.logits.shape[-1])
-    return jnp.sum(log_probs * chosen, axis=-1)
+    one_hot = jax.nn.one_hot(action, self.logits.shape[-1])
+    return jnp.sum(log_probs * one_hot, axis=-1)
 
   def entropy(self) -> jax.Array:
     """Returns the entropy of each distribution, `(...)`."""

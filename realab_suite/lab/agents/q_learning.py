@@ -244,8 +244,8 @@ def sample(
   world = generator.integers(num_envs, size=shape)
   if places is not None:
     size = shape[0], max(1, int(share * shape[1]))
-    chosen = generator.integers(len(places[0]), size=size)
-    start[:, : size[1]], world[:, : size[1]] = (x[chosen] for x in places)
+    indices = generator.integers(len(places[0]), size=size)
+    start[:, : size[1]], world[:, : size[1]] = (x[indices] for x in places)
   total, factor = np.zeros(shape, np.float32), np.ones(shape, np.float32)
   is_running, length = np.ones(shape, bool), np.zeros(shape, int)
   for i in range(options.num_returns):
@@ -315,15 +315,15 @@ def _loss(
     network: networks.Network, data: dict[str, Any]
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
   values = network(data['encoded'])
-  chosen = _pick(values, data['action'])
-  loss = training.mean(optax.huber_loss(chosen, data['target']), data['weight'])
+  value = _pick(values, data['action'])
+  loss = training.mean(optax.huber_loss(value, data['target']), data['weight'])
   return loss, {
       'value_loss': loss,
-      'value': training.mean(chosen, data['weight']),
+      'value': training.mean(value, data['weight']),
   }
 
 
 def _pick(values: jax.Array, action: jax.Array) -> jax.Array:
   """Returns the values of actions, `(...)`, of those of all of them."""
-  chosen = jax.nn.one_hot(action, values.shape[-1])
-  return jnp.sum(values * chosen, axis=-1)
+  one_hot = jax.nn.one_hot(action, values.shape[-1])
+  return jnp.sum(values * one_hot, axis=-1)

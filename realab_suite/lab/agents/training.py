@@ -243,8 +243,8 @@ class FeedbackScale:
         batch['reading'], batch['is_valid'], strict=True
     ):
       sums = self._gamma * self._sums + reading
-      known = sums[is_valid]
-      self._moments += (len(known), known.sum(), (known**2).sum())
+      totals = sums[is_valid]
+      self._moments += (len(totals), totals.sum(), (totals**2).sum())
       self._sums = np.where(is_valid, sums, 0.0)
 
   def state(self) -> dict[str, np.ndarray]:

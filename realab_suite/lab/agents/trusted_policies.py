@@ -65,11 +65,11 @@ class TrustedPolicy(validation.Model):
     """
     policy = policies.make(self.policy, **self.options)
     where = f'{owner}.trusted.policy {self.policy!r}'
-    known = controls.action_set
-    rule = 'vectors' if known is None else known.key
-    if known is not None:
-      policy = policy.in_action_set(known)
-    if known is None or policy.action_set.key != known.key:
+    action_set = controls.action_set
+    rule = 'vectors' if action_set is None else action_set.key
+    if action_set is not None:
+      policy = policy.in_action_set(action_set)
+    if action_set is None or policy.action_set.key != action_set.key:
       raise errors.SpecError(
           f'{where}: has the actions of {policy.action_set.key}; must be'
           f' those of the learner, {rule}'
@@ -107,11 +107,11 @@ class TrustedActor:
   ) -> base.Choice:
     """Returns a choice with its actions in its worlds; see `base.Wrapper`."""
     is_first = np.asarray(time_step.step_type)[self.acts] == base.FIRST
-    seen = {n: value[self.acts] for n, value in time_step.observation.items()}
+    view = {n: value[self.acts] for n, value in time_step.observation.items()}
     words = np.random.SeedSequence([int(word) for word in key])
     seeds = words.spawn(len(is_first))
     keys = np.stack([seed.generate_state(2, np.uint64) for seed in seeds])
-    actions, self._state = self._policy.step(seen, is_first, keys, self._state)
+    actions, self._state = self._policy.step(view, is_first, keys, self._state)
     action = choice['action'].copy()
     action[self.acts] = actions
     return {**choice, 'action': action}

@@ -99,10 +99,10 @@ class LearnedReward(base.Defence):
       key: np.ndarray,
   ) -> base.Treated:
     data = base.data_of(batch, setting, with_readings=False)
-    seen, ages, joined = ensembles.join_spans(
+    spans, ages, joined = ensembles.join_spans(
         state['spans'], data, batch['is_valid']
     )
-    steps, known = state['counts'] + (ages.size, 0)
+    steps, num_known = state['counts'] + (ages.size, 0)
     is_kept = self.refit == 'never' and state['counts'][0] >= self.fit_steps
     is_end = (ages > 0) & (ages % self._span == 0) & (not is_kept)
     if self.trusted is not None:
@@ -114,24 +114,24 @@ class LearnedReward(base.Defence):
       moments = moments + np.array(
           [readings.size, readings.sum(), readings @ readings]
       )
-      known += readings.size
+      num_known += readings.size
     mean, deviation = training.mean_and_deviation(moments)
     targets = (readings - mean) / deviation
     if self.source == 'comparisons':
       targets = 0.5 + 0.5 * np.clip(np.rint(readings), -1, 1)
-      known += np.count_nonzero(targets != 0.5)
+      num_known += np.count_nonzero(targets != 0.5)
     if ends.size:
       ensemble = ensembles.fit(
           setting.options,
           ensemble,
-          seen,
+          spans,
           ends,
           targets,
           self._span,
           (self.gradients, self.nets, self.minibatch),
           key,
       )
-    if steps >= self.fit_steps and not known:
+    if steps >= self.fit_steps and not num_known:
       raise errors.SpecError(
           f'learner.defence.fit_steps: {self.fit_steps}, but {steps} control'
           f' steps had no {self.source} to learn from; must be more, in'
@@ -142,9 +142,9 @@ class LearnedReward(base.Defence):
     kept = {
         'ensemble': ensemble,
         'spans': joined,
-        'counts': np.array([steps, known]),
+        'counts': np.array([steps, num_known]),
         'moments': moments,
     }
-    metrics = {'disagreement': values.std(axis=0).mean(), 'taught': known}
+    metrics = {'disagreement': values.std(axis=0).mean(), 'taught': num_known}
     treated = {**batch, 'reading': reading.astype(np.float32)}
     return base.Treated(treated, kept, metrics)

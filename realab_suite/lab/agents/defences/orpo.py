@@ -126,9 +126,11 @@ def _discriminate(
 
   def loss(network: Any, index: jax.Array) -> Any:
     # `index` is `(2, minibatch)`: both sides in one call.
-    chosen = jax.tree.map(lambda x: x[index], samples)
-    own, other = network(chosen)[..., 0]
-    value = jnp.mean(jax.nn.softplus(-own)) + jnp.mean(jax.nn.softplus(other))
+    minibatch = jax.tree.map(lambda x: x[index], samples)
+    own_ratio, trusted_ratio = network(minibatch)[..., 0]
+    value = jnp.mean(jax.nn.softplus(-own_ratio)) + jnp.mean(
+        jax.nn.softplus(trusted_ratio)
+    )
     return value, {'loss': value}
 
   def one_step(carry: Any, index: jax.Array) -> Any:
