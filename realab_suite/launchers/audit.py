@@ -74,14 +74,14 @@ def main() -> int:
     output, folder = flags.OUTPUT.value, None
     if output is not None:
       folder = storage.new_folder(output)
-    found = auditor.run()
-  program.say(findings.words(found, _command()))
+    result = auditor.run()
+  program.say(findings.words(result, _command()))
   if folder is not None:
     film = None
-    if has_film and found.is_exploitable:
+    if has_film and result.is_exploitable:
       film = folder / _FILM_NAME
-      _write_film(auditor, found, settings.design.name, film)
-      program.say(f'The film of world {found.film_world} is {film}')
+      _write_film(auditor, result, settings.design.name, film)
+      program.say(f'The film of world {result.film_world} is {film}')
     content = {
         'kind': 'audit',
         'schema': 2,
@@ -89,17 +89,17 @@ def main() -> int:
         'design': settings.design.to_mapping(),
         'seed': settings.seed,
         'target': settings.target,
-        **found.model_dump(mode='json'),
+        **result.model_dump(mode='json'),
         'film': film and str(film),
         'versions': results.versions(),
     }
     storage.write_json(folder / REPORT, content)
     program.say(f'Results are in {folder}')
-  if found.is_exploitable:
+  if result.is_exploitable:
     return _EXPLOITABLE
-  if found.verdict == findings.UNDECIDED:
+  if result.verdict == findings.UNDECIDED:
     return _UNDECIDED
-  return 0 if found.is_sufficient else _NOT_SUFFICIENT
+  return 0 if result.is_sufficient else _NOT_SUFFICIENT
 
 
 def _has_film() -> bool:
@@ -138,14 +138,14 @@ def _command() -> str:
 
 
 def _write_film(
-    auditor: Any, found: Any, title: str, path: pathlib.Path
+    auditor: Any, result: Any, title: str, path: pathlib.Path
 ) -> None:
   """Repeats the plan in one world of the comparison, and films it."""
   from realab_suite.evaluation import evaluate
   from realab_suite.lab.experiments import tracking
   from realab_suite.reports import films
 
-  with auditor.repeated(found) as (env, policy):
+  with auditor.repeated(result) as (env, policy):
     with films.film(env, path, f'{title}: exploit') as add:
       evaluate.evaluate(env, policy, 1, sinks=[tracking.Tracker(env, add)])
 

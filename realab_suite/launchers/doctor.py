@@ -83,15 +83,15 @@ EXTRAS: Mapping[str, Extra] = {
 
 def versions() -> str:
   """Returns the versions of this package, Python and the main packages."""
-  found = [f'Python {platform.python_version()}']
+  entries = [f'Python {platform.python_version()}']
   for name in _PACKAGES:
     try:
-      found.append(f'{name} {metadata.version(name)}')
+      entries.append(f'{name} {metadata.version(name)}')
     except metadata.PackageNotFoundError:
-      found.append(f'{name} missing')
+      entries.append(f'{name} missing')
   if 'realab' in (version := _labmaze()):
-    found.append(f'labmaze {version}, a stand-in with other mazes')
-  return ', '.join(found)
+    entries.append(f'labmaze {version}, a stand-in with other mazes')
+  return ', '.join(entries)
 
 
 def _labmaze() -> str:

@@ -165,10 +165,10 @@ def take(*shared: flags.FlagHolder[Any]) -> None:
 
   Call it when the module of the launcher is imported.
   """
-  for one in shared:
-    if one.name not in flags.FLAGS:
-      flags.FLAGS[one.name] = _SHARED[one.name]
-    flags.declare_key_flag(one.name)
+  for holder in shared:
+    if holder.name not in flags.FLAGS:
+      flags.FLAGS[holder.name] = _SHARED[holder.name]
+    flags.declare_key_flag(holder.name)
 
 
 def required(flag: flags.FlagHolder[Any], why: str = '') -> Any:

@@ -48,13 +48,13 @@ def main() -> None:
 
   export.check('parquet', output)
   flags.load_imports()
-  found = [*_of_sweep(), *_scripted(seeds)]
-  if not found:
+  run_sources = [*_of_sweep(), *_scripted(seeds)]
+  if not run_sources:
     raise errors.SpecError(
         '--policies, --designs: nothing to run; name a policy and a design, or'
         ' a sweep with --input'
     )
-  export.labelled(found, output, program.say)
+  export.labelled(run_sources, output, program.say)
   program.say(f'The dataset is in {output}')
 
 
@@ -81,8 +81,8 @@ def _scripted(seeds: tuple[int, ...]) -> list[Any]:
   from realab_suite.feedback import specs
 
   world = flags.world()
-  chosen = flags.POLICIES.value
-  names = world.scripted if chosen is None else tuple(chosen)
+  policy_names = flags.POLICIES.value
+  names = world.scripted if policy_names is None else tuple(policy_names)
   for policy in names:
     policies.POLICIES.get(policy)
   overrides = tuple(flags.SET.value)
@@ -92,7 +92,7 @@ def _scripted(seeds: tuple[int, ...]) -> list[Any]:
       [specs.load(design, [one]) for one in channels] or [design]
       for design in designs
   ]
-  found = []
+  run_sources = []
   for design, of_design in zip(designs, twins, strict=True):
     stake = None
     if names:
@@ -102,7 +102,7 @@ def _scripted(seeds: tuple[int, ...]) -> list[Any]:
     for twin in of_design:
       for policy in names:
         program.say(f'{policy} acts in {twin.name} ({twin.channel})')
-        found.append(
+        run_sources.append(
             sources.of_policy(
                 policy,
                 policy,
@@ -113,7 +113,7 @@ def _scripted(seeds: tuple[int, ...]) -> list[Any]:
                 stake=stake,
             )
         )
-  return found
+  return run_sources
 
 
 if __name__ == '__main__':

@@ -39,8 +39,8 @@ def main() -> None:
   from realab_suite.reports import html_page
 
   flags.load_imports()
-  chosen = flags.OUTPUT.value
-  output = pathlib.Path(chosen) if chosen else folder
+  folder_name = flags.OUTPUT.value
+  output = pathlib.Path(folder_name) if folder_name else folder
   path = html_page.write(folder, output, program.say, no_clips)
   program.say(f'The report is {path}')
 

@@ -28,8 +28,8 @@ def main() -> None:
 
   flags.load_imports()
   world, design = flags.world(), flags.design()
-  found = judging.stakes_of(world, design)
-  if found is None:
+  stake = judging.stakes_of(world, design)
+  if stake is None:
     raise errors.SpecError(
         f'design {design.name!r} has no stake:'
         f' {judging.why_no_stakes(world, design)}'
@@ -37,19 +37,19 @@ def main() -> None:
   rows = [
       ['part of the objective', 'stake', 'more than', 'degenerate', 'confirmed']
   ]
-  for name, one in found.parts.items():
-    ends = f'{one.estimate:.4g} [{one.low:.4g}, {one.high:.4g}]'
+  for name, part in stake.parts.items():
+    ends = f'{part.estimate:.4g} [{part.low:.4g}, {part.high:.4g}]'
     answers = [
         'yes' if is_so else 'no'
-        for is_so in (one.is_degenerate, one.is_confirmed)
+        for is_so in (part.is_degenerate, part.is_confirmed)
     ]
-    rows.append([name, ends, one.than, *answers])
+    rows.append([name, ends, part.than, *answers])
   program.say(
       f'{tables.markdown(rows)}\n\n{world.solver} in'
       f' {world.domain}.{world.reference}, {stakes.NUM_EPISODES} episodes of'
       f' {world.max_steps} steps, with 95 % intervals; confirmed in'
       f' {world.domain}.{world.task}, whose median counts if it is clearly'
-      f' smaller; key {found.key}'
+      f' smaller; key {stake.key}'
   )
 
 

@@ -60,7 +60,7 @@ def main() -> None:
 
   flags.load_imports()
   world = flags.world()
-  chosen = (
+  design_source = (
       flags.DESIGN.value
       if flags.DESIGN.present
       else supervised_designs.design(
@@ -71,7 +71,7 @@ def main() -> None:
           action_set=world.action_set,
       )
   )
-  design = specs.load(chosen, tuple(flags.SET.value))
+  design = specs.load(design_source, tuple(flags.SET.value))
   with contextlib.ExitStack() as stack:
     env = world.load(design, flags.SEED.value)
     stack.enter_context(contextlib.closing(env))
