@@ -88,9 +88,9 @@ class Recorded(Source):
     try:
       with open(file, encoding='utf-8') as lines:
         for line in lines:
-          one = json.loads(line)
-          key = (str(one['asks']), *(int(part) for part in one['key']))
-          self._answers[key] = float(one['value'])  # type: ignore[index]
+          record = json.loads(line)
+          key = (str(record['asks']), *(int(part) for part in record['key']))
+          self._answers[key] = float(record['value'])  # type: ignore[index]
     except (OSError, ValueError, KeyError, TypeError) as error:
       raise errors.SpecError(
           f'answers: {messages.quote(str(file))}: {messages.exception(error)};'
@@ -99,10 +99,10 @@ class Recorded(Source):
 
   def answer(self, question: Question) -> Answer:
     keys = question.key.reshape(-1, 2).tolist()
-    found = [self._answers.get((question.asks, *key)) for key in keys]
+    answers = [self._answers.get((question.asks, *key)) for key in keys]
     shape = np.shape(question.is_asked)
-    speaks = np.array([one is not None for one in found]).reshape(shape)
-    return np.array([one or 0.0 for one in found]).reshape(shape), speaks
+    speaks = np.array([one is not None for one in answers]).reshape(shape)
+    return np.array([one or 0.0 for one in answers]).reshape(shape), speaks
 
 
 @ANSWERS.add('live')

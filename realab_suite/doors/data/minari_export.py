@@ -141,8 +141,8 @@ def write(
           # The default would compress images, with losses.
           jpeg_encoding=False,
       )
-    every = itertools.chain([first], agents)
-    dataset.storage.update_episodes(map(buffer_of, every))
+    streams = itertools.chain([first], agents)
+    dataset.storage.update_episodes(map(buffer_of, streams))
 
 
 @contextlib.contextmanager

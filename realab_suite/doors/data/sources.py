@@ -38,10 +38,10 @@ def of_run(run: sweep_results.Run, num_episodes: int) -> Source:
     )
   by_seed: dict[int, list[replays.Recorded]] = {}
   for row in sorted(run.rows, key=lambda row: row.key):
-    chosen = by_seed.setdefault(row.seed, [])
-    if len(chosen) < num_episodes:
-      chosen.append(replays.recorded(run, row))
-  return [one for chosen in by_seed.values() for one in chosen]
+    recordings = by_seed.setdefault(row.seed, [])
+    if len(recordings) < num_episodes:
+      recordings.append(replays.recorded(run, row))
+  return [one for recordings in by_seed.values() for one in recordings]
 
 
 def of_policy(
@@ -84,7 +84,7 @@ def of_policy(
           batch, batch_actors.BatchPolicyActor(actor, batch, seed)
       )
       batch.add_sink(tracer)
-      found = evaluate.evaluate_batch(batch, tracer)
+      episode_results = evaluate.evaluate_batch(batch, tracer)
       trace = tracer.trace()
       episodes += [
           replays.Recorded(
@@ -95,6 +95,6 @@ def of_policy(
               trace,
               index,
           )
-          for index, result in enumerate(found)
+          for index, result in enumerate(episode_results)
       ]
   return episodes

@@ -126,7 +126,7 @@ def _relative(
   """
   design, row = episode.recorded.design, episode.recorded.row
   stake = stakes.of(row)
-  found = [
+  relative_gains = [
       terms[part.name].gain
       * (row.num_steps if part.kind == objectives.RETURN else 1)
       / stake.parts[part.name].estimate
@@ -136,7 +136,7 @@ def _relative(
       and part.discount == 1
       and not stake.parts[part.name].is_degenerate
   ]
-  return _known(max(found)) if found else None
+  return _known(max(relative_gains)) if relative_gains else None
 
 
 def _largest(rows_of_step: tuple[Row, ...]) -> Row:
@@ -175,7 +175,7 @@ def _register(episode: recording.Episode, name: str) -> Iterator[Row]:
     entries = by_step.get(step, [])
     writes = [e for e in entries if isinstance(e, registers.Write)]
     write = writes[-1] if writes else write
-    seen = [
+    readings = [
         entry.reading
         for entry in entries
         if isinstance(entry, registers.Read) and entry.reader == registers.AGENT
@@ -189,7 +189,7 @@ def _register(episode: recording.Episode, name: str) -> Iterator[Row]:
         'requested': write.requested,
         'applied': write.applied,
         'is_written': bool(writes),
-        'observed': seen[-1] if seen else None,
+        'observed': readings[-1] if readings else None,
         'reading': state.reading,
         'clean': _known(state.clean),
         'corruption': _known(state.reading - state.clean),

@@ -106,8 +106,8 @@ def write(
   with _opened(make, settings, first_seed, wrap) as env:
     loaded = single.environment_of(env)
     world, design = _world_of(loaded, settings), loaded.mechanism.design
-    chosen = _baselines(baselines, world.solver, agents)
-    for run in chosen:
+    baseline_names = _baselines(baselines, world.solver, agents)
+    for run in baseline_names:
       aiming.make_policy(run, loaded, None, 0)
   judged = _judged_design(design, settings.get('reward_register'))
   objective = judged.objective
@@ -116,7 +116,7 @@ def write(
       judged,
       storage.new_folder(output),
       lambda line: None,
-      control=chosen[0],
+      control=baseline_names[0],
   ) as evaluation:
     evaluation.measure()
     evaluation.describe(
@@ -125,27 +125,27 @@ def write(
         objective=objective and objective.to_mapping(),
         settings={k: v for k, v in settings.items() if k != 'design'},
         agents={agent: len(of) for agent, of in agents.items()},
-        baselines=list(chosen),
+        baselines=list(baseline_names),
         num_episodes=num_episodes,
         first_seed=first_seed,
     )
     for i in range(num_seeds):
       with _opened(make, settings, first_seed + i, wrap) as env:
         loaded = single.environment_of(env)
-        for run in chosen:
+        for run in baseline_names:
           info = evaluation.info(loaded, run, run)
           for episode in range(num_episodes):
             policy = aiming.make_policy(run, loaded, None, episode)
-            [found] = evaluate.evaluate(
+            [result] = evaluate.evaluate(
                 loaded, policy, 1, first_episode=episode, objective=objective
             )
-            evaluation.add(info, found)
+            evaluation.add(info, result)
         for run, of_seeds in agents.items():
           info = evaluation.info(loaded, run, run)
-          for found in gymnasium_evaluation.evaluate(
+          for result in gymnasium_evaluation.evaluate(
               env, of_seeds[i], num_episodes, objective=objective
           ):
-            evaluation.add(info, found)
+            evaluation.add(info, result)
     title = (
         f'# {name}\n\nSeeds: {num_seeds}; episodes per seed: {num_episodes};'
         ' means with 95 % intervals.'
@@ -249,12 +249,12 @@ def _num_seeds(
 
 
 def _baselines(
-    given: Sequence[str] | None, solver: str | None, agents: Collection[str]
+    names: Sequence[str] | None, solver: str | None, agents: Collection[str]
 ) -> tuple[str, ...]:
   """Returns the names of the baselines, the control first.
 
   Args:
-    given: Names that the caller gave, or `None`.
+    names: Names that the caller gave, or `None`.
     solver: Name of the policy that solves the task, or `None`.
     agents: Names of the agents.
 
@@ -262,23 +262,23 @@ def _baselines(
     SpecError: If there is none, one is there twice, the solver is missing, or
       an agent has the name of a baseline.
   """
-  if given is None:
-    given = [stakes.RANDOM] if solver is None else [solver, stakes.RANDOM]
-  if not given:
+  if names is None:
+    names = [stakes.RANDOM] if solver is None else [solver, stakes.RANDOM]
+  if not names:
     raise errors.SpecError('baselines: []; at least one is needed')
-  if policies.base.SOLVER in given and solver is None:
+  if policies.base.SOLVER in names and solver is None:
     raise errors.SpecError(
         'baselines: solver: the task names no solver; name other' ' policies'
     )
-  given = [solver or n if n == policies.base.SOLVER else n for n in given]
-  if len({*given}) != len(given):
+  names = [solver or n if n == policies.base.SOLVER else n for n in names]
+  if len({*names}) != len(names):
     raise errors.SpecError(
-        f'baselines: {given}; each policy must be given once'
+        f'baselines: {names}; each policy must be given once'
     )
   # Tables do not judge runs with the names of controls.
-  for name in (*given, stakes.RANDOM, stakes.AT_REST):
+  for name in (*names, stakes.RANDOM, stakes.AT_REST):
     if name in agents:
       raise errors.SpecError(
           f'agents: {name!r} is the name of a baseline; choose another name'
       )
-  return tuple(given)
+  return tuple(names)

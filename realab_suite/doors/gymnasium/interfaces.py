@@ -92,20 +92,20 @@ class Interface:
       SpecError: If an option is invalid.
     """
     check_names(options, Options.model_fields)
-    chosen = validation.validate(Options, options, 'options')
+    values = validation.validate(Options, options, 'options')
     spec = view.observation_spec()
-    self.reward_key = codecs.reward_key(chosen.reward_register, spec)
-    self.observations = codecs.ObservationCodec(spec, chosen.dtype, chosen.flat)
-    self.actions = codecs.ActionCodec(view.action_spec(), chosen.dtype)
+    self.reward_key = codecs.reward_key(values.reward_register, spec)
+    self.observations = codecs.ObservationCodec(spec, values.dtype, values.flat)
+    self.actions = codecs.ActionCodec(view.action_spec(), values.dtype)
     self.metadata = {
         'render_modes': ['rgb_array'],
         'render_fps': 1.0 / task.control_timestep,
     }
-    self.render_mode = chosen.render_mode
+    self.render_mode = values.render_mode
     model = task.root_entity.mjcf_model
     camera: str | int = _DEFAULT
-    if chosen.camera_name is not None:
-      camera = arguments.camera(chosen.camera_name, model)
+    if values.camera_name is not None:
+      camera = arguments.camera(values.camera_name, model)
     elif model.find('camera', _DEFAULT) is None:
       camera = _FREE
-    self.frame = (camera, chosen.height, chosen.width)
+    self.frame = (camera, values.height, values.width)

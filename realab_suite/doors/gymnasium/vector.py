@@ -202,21 +202,21 @@ class RealabVectorEnv(agent_view.Uncopied, gym.vector.VectorEnv):
     return np.where(time_step.first(), 0.0, readings)
 
 
-def _checked_mode(given: Any) -> AutoresetMode:
+def _checked_mode(value: Any) -> AutoresetMode:
   try:
-    return AutoresetMode(given)
+    return AutoresetMode(value)
   except ValueError:
     allowed = [mode.value for mode in AutoresetMode]
     raise errors.SpecError(
-        f'autoreset_mode: {messages.quote(given)}; must be one of {allowed}'
+        f'autoreset_mode: {messages.quote(value)}; must be one of {allowed}'
     ) from None
 
 
-def _checked_mask(given: Any, num_envs: int, seed: Any) -> np.ndarray:
-  mask = np.asarray(given)
+def _checked_mask(reset_mask: Any, num_envs: int, seed: Any) -> np.ndarray:
+  mask = np.asarray(reset_mask)
   if mask.shape != (num_envs,) or mask.dtype != bool or not mask.any():
     raise errors.SpecError(
-        f'reset_mask: {messages.quote(given)}; must be an array of'
+        f'reset_mask: {messages.quote(reset_mask)}; must be an array of'
         f' {num_envs} bools, at least one of them True'
     )
   if seed is not None:
