@@ -41,12 +41,12 @@ class ActionSet:
     names = [name for name, _ in self.actions]
     values = [x for _, settings in self.actions for x in settings.values()]
     for is_allowed, field, given, allowed in (
-        (_is_name(self.name), 'name', self.name, 'names such as drive'),
+        (_is_name(self.name), 'name', self.name, 'a name such as drive'),
         (
             type(self.version) is int and self.version >= 1,
             'version',
             self.version,
-            'integers from 1',
+            'an integer from 1',
         ),
         (
             names and len(set(names)) == len(names),

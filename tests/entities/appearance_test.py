@@ -85,7 +85,7 @@ def test_the_specs_of_all_worlds_have_the_same_classes(domain: str):
 @pytest.mark.parametrize(
     ('name', 'code', 'rgba', 'message'),
     [
-        ('wall', 31, None, "'wall': registered already, with code 2; allowed"),
+        ('wall', 31, None, "'wall': registered already, with code 2; must"),
         ('rock', 2, None, r"'rock': code 2 is that of 'wall'; .* \[19, 20, "),
         ('rock', 32, None, r"'rock': code 32; must be one of \[.*, 31\]$"),
         ('rock', True, None, r"'rock': code True; must be one of \["),
@@ -112,7 +112,7 @@ def test_unknown_classes_are_refused():
 
 
 def test_a_geom_of_a_class_without_a_colour_needs_one():
-  with pytest.raises(errors.SpecError, match="'base_block': rgba None; allo"):
+  with pytest.raises(errors.SpecError, match="'base_block': rgba None; must"):
     appearance.geom_style('base_block')
   style = appearance.geom_style('base_block', _GREY)
   assert style == {'user': [9], 'rgba': _GREY}

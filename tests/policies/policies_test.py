@@ -10,7 +10,7 @@ from realab_suite import testing
 from realab_suite.engine import environment
 from realab_suite.entities import appearance
 from realab_suite.entities import avatars
-from realab_suite.feedback import providers
+from realab_suite.feedback.providers import demonstration
 from realab_suite.policies import action_sets
 from realab_suite.policies import navigation
 from realab_suite.policies import simple
@@ -64,7 +64,7 @@ def _load(
 )
 def test_saboteurs_keep_the_contract_of_demonstrators(name: str):
   testing.check_provider(
-      providers.Demonstration(policy=name, writes=('reward',))
+      demonstration.Demonstration(policy=name, writes=('reward',))
   )
 
 
