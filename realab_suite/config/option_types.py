@@ -99,14 +99,14 @@ class ModelIn:
     del schema
     models = (self._models.get(kind) for kind in self._models)
     union: Any = functools.reduce(operator.or_, models)
-    found = handler(
+    union_schema = handler(
         pydantic.TypeAdapter(
             Annotated[union, pydantic.Field(discriminator='kind')]
         ).core_schema
     )
     if self._name is None:
-      return found
-    return {'anyOf': [self._name.json_schema(), found]}
+      return union_schema
+    return {'anyOf': [self._name.json_schema(), union_schema]}
 
 
 @final
@@ -200,12 +200,14 @@ def _options_of(
     if function is reserved:
       break
     parameters = inspect.signature(function, eval_str=True).parameters.values()
-    for one in parameters:
-      if one.kind in _BY_NAME and one.name not in (*taken, *fields):
-        fields[one.name] = (
-            one.name,
-            Any if one.annotation is one.empty else one.annotation,
-            pydantic.Field(... if one.default is one.empty else one.default),
+    for option in parameters:
+      if option.kind in _BY_NAME and option.name not in (*taken, *fields):
+        fields[option.name] = (
+            option.name,
+            Any if option.annotation is option.empty else option.annotation,
+            pydantic.Field(
+                ... if option.default is option.empty else option.default
+            ),
         )
     if all(one.kind is not one.VAR_KEYWORD for one in parameters):
       break

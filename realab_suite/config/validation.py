@@ -225,10 +225,10 @@ def validate(
     where = loading.override_name(override)
     hint = loading.hint_at_keys(override, data)
   problems = judged(count)[1]
-  told = problems[:_MAX_TOLD]
+  texts = problems[:_MAX_TOLD]
   if len(problems) > _MAX_TOLD:
-    told.append(f'and {len(problems) - _MAX_TOLD} more')
-  raise messages.Location(where).error('; '.join(told) + hint)
+    texts.append(f'and {len(problems) - _MAX_TOLD} more')
+  raise messages.Location(where).error('; '.join(texts) + hint)
 
 
 def are_paths_confined(info: pydantic.ValidationInfo) -> bool:
@@ -253,27 +253,31 @@ def check_path(path: str, info: pydantic.ValidationInfo) -> str:
 
 def _problems(error: pydantic.ValidationError, data: Any) -> list[str]:
   """Returns the problems of data, each with its place and the given value."""
-  found = error.errors(include_url=False)
+  details = error.errors(include_url=False)
   # Classes in unions of what a file can contain and what only Python can make.
-  told = [one for one in found if one['type'] not in _NOT_IN_FILES] or found
+  problems = [
+      one for one in details if one['type'] not in _NOT_IN_FILES
+  ] or details
   # A list with wrong items is too short without them, which is no news.
-  told = [
+  problems = [
       one
-      for one in told
+      for one in problems
       if one['type'] != 'too_short'
       or len(one['input']) < one['ctx']['min_length']
   ]
-  told = [one for one in told if not _is_of_another_member(one, told, data)]
+  problems = [
+      one for one in problems if not _is_of_another_member(one, problems, data)
+  ]
   # A union may report a problem once for each of its members.
   return list(
       dict.fromkeys(
           ': '.join(filter(None, (_path(one, data), _describe(one))))
-          for one in told
+          for one in problems
       )
   )
 
 
-def _is_of_another_member(details: Any, others: Any, data: Any) -> bool:
+def _is_of_another_member(details: Any, problems: Any, data: Any) -> bool:
   """Returns whether a problem is of a member of a union that was not meant.
 
   A text was meant as one of the names that a union allows, and a mapping as the
@@ -286,7 +290,7 @@ def _is_of_another_member(details: Any, others: Any, data: Any) -> bool:
   return any(
       (other['type'] == 'literal_error') != is_name
       and _path(other, data) == _path(details, data)
-      for other in others
+      for other in problems
   )
 
 
@@ -322,31 +326,31 @@ def _is_item(details: Any) -> bool:
 
 def _describe(details: Any) -> str:
   """Returns the error message, followed by the value."""
-  given = _quote(details['input'])
+  value = _quote(details['input'])
   if _is_item(details):
-    return f'must have at least {details["loc"][-1] + 1} items, got {given}'
+    return f'must have at least {details["loc"][-1] + 1} items, got {value}'
   if details['type'] == 'missing':
     name = details['loc'][-1]
     close = messages.nearest(name, map(str, details['input']))
     hint = f'; is {close!r} meant to be {name!r}?' if close else ''
     return f'required key is missing{hint}'
   if details['type'] in _IN_WORDS_OF_YAML:
-    return f'must be {_IN_WORDS_OF_YAML[details["type"]]}, got {given}'
+    return f'must be {_IN_WORDS_OF_YAML[details["type"]]}, got {value}'
   if details['type'] == 'string_pattern_mismatch':
     pattern = details['ctx']['pattern']
     rule = _PATTERNS.get(pattern, f'a text that matches {pattern!r}')
-    return f'must be {rule}, got {given}'
+    return f'must be {rule}, got {value}'
   if 'error' not in details.get('ctx', {}):
     rule = re.sub(r'^\w+ should ', 'must ', details['msg'])
     rule = re.sub(r' after validation, not \w+$', '', rule)
     hint = ''
     if details['type'] == 'literal_error':
-      known = re.findall(r"'([^']*)'", details['ctx']['expected'])
-      hint = messages.did_you_mean(details['input'], known)
-    return f'{rule}, got {given}{hint}'
+      choices = re.findall(r"'([^']*)'", details['ctx']['expected'])
+      hint = messages.did_you_mean(details['input'], choices)
+    return f'{rule}, got {value}{hint}'
   # The message of a validator may have several lines.
   text = ' '.join(str(details['ctx']['error']).split())
   # The problem of a mapping names the wrong part of it already.
-  if isinstance(details['input'], Mapping) or given in text:
+  if isinstance(details['input'], Mapping) or value in text:
     return text
-  return f'{text}, got {given}'
+  return f'{text}, got {value}'
