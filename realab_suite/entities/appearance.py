@@ -164,8 +164,8 @@ def class_name(code: int) -> str:
   Raises:
     UnknownNameError: If no class with this code is registered.
   """
-  for name, one in _CLASSES.items():
-    if one.code == code:
+  for name, object_class in _CLASSES.items():
+    if object_class.code == code:
       return name
   raise errors.UnknownNameError(
       f'class of objects with code {code!r:.80}: unknown; known are {_known()}'
@@ -186,14 +186,14 @@ def geom_style(name: str, rgba: Any = None) -> dict[str, Any]:
     SpecError: If there is no colour.
     UnknownNameError: If no class of this name is registered.
   """
-  found = _find(name)
-  colour = found.rgba if rgba is None else rgba
+  object_class = _find(name)
+  colour = object_class.rgba if rgba is None else rgba
   if colour is None:
     raise errors.SpecError(
         f'class of objects {name!r:.80}: rgba None; must be a colour,'
         ' because the class has none'
     )
-  return {'user': [found.code], 'rgba': colour}
+  return {'user': [object_class.code], 'rgba': colour}
 
 
 def class_of_geoms(model: Any) -> np.ndarray:
@@ -221,11 +221,11 @@ def listed_codes(root: mjcf.RootElement) -> tuple[int, ...]:
       for model in {geom.root for geom in geoms}
       for default in (model.default, *model.default.find_all('default'))
   ]
-  found = {
+  codes = {
       int(geom.user[0]) for geom in (*geoms, *defaults) if geom.user is not None
   }
   return tuple(
-      sorted(found.intersection(_codes_of_geoms()) | set(range(_NUM_LISTED)))
+      sorted(codes.intersection(_codes_of_geoms()) | set(range(_NUM_LISTED)))
   )
 
 

@@ -45,15 +45,15 @@ def choose(condition: np.ndarray, yes: Any, no: Any) -> Any:
   return yes if condition else no
 
 
-def both(one: Mask, other: Mask) -> Mask:
+def both(first: Mask, second: Mask) -> Mask:
   """Returns the mask of the worlds in which two masks are true.
 
   The result is `None` if that is so in all worlds.
   """
-  if one is None or other is None:
-    mask = other if one is None else one
+  if first is None or second is None:
+    mask = second if first is None else first
   else:
-    mask = one & other
+    mask = first & second
   return None if mask is None or everywhere(mask) else mask
 
 

@@ -48,13 +48,13 @@ class Crate(measurables.MeasurableEntity):
     Raises:
       SpecError: If the size or the mass is outside the limits of blocks.
     """
-    for what, given, least, most in (
+    for field, value, least, most in (
         ('size', size, block_kinds.LEAST_SIZE, _LARGEST),
         ('mass', mass, 0.01, 100.0),
     ):
-      if not isinstance(given, int | float) or not least <= given <= most:
+      if not isinstance(value, int | float) or not least <= value <= most:
         raise errors.SpecError(
-            f'crate {name!r}: {what} {given!r:.40}; must be from {least:g} to'
+            f'crate {name!r}: {field} {value!r:.40}; must be from {least:g} to'
             f' {most:g}'
         )
     self._mjcf_root = mjcf.RootElement(model=name)

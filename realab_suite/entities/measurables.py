@@ -99,11 +99,11 @@ def bodies_in_world(root: composer.Entity) -> dict[str, Measurable]:
   Args:
     root: Root entity of a task.
   """
-  found = root.mjcf_model.find_all('body')
-  found += root.mjcf_model.find_all('attachment_frame')
+  elements = root.mjcf_model.find_all('body')
+  elements += root.mjcf_model.find_all('attachment_frame')
   return {
       body.full_identifier: Measurable((body,))
-      for body in found
+      for body in elements
       if body.full_identifier
   }
 

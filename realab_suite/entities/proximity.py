@@ -60,9 +60,9 @@ class Proximity:
     centres, matrices = np.asarray(bound.xpos), np.asarray(bound.xmat)
     worlds = centres.shape[:-2]
     radii = physics.model.geom_rbound[geoms]
-    one, other = self._pairs.T
-    offsets = centres[..., one, :] - centres[..., other, :]
-    reach = radii[one] + radii[other] + self._limit
+    first, second = self._pairs.T
+    offsets = centres[..., first, :] - centres[..., second, :]
+    reach = radii[first] + radii[second] + self._limit
     is_near = (offsets * offsets).sum(axis=-1) <= reach**2
     close = np.zeros(worlds, bool)
     model = physics.model
@@ -73,7 +73,7 @@ class Proximity:
         if model not in _data:
           _data[model] = mujoco.MjData(model.ptr)
         near = self._pairs[pair]
-        found, _ = distance(
+        gap, _ = distance(
             model.ptr,
             _data[model],
             geoms[near],
@@ -81,7 +81,7 @@ class Proximity:
             matrices[where][near],
             2.0 * self._limit + 0.01,
         )
-        close[where] = found <= self._limit
+        close[where] = gap <= self._limit
     return close[()]
 
 
@@ -107,14 +107,14 @@ def distance(
     The distance, which is 0 if MuJoCo cannot compute it, and the point between
     the surfaces, `(3,)`, in m.
   """
-  one, other = map(int, geoms)
+  first, second = map(int, geoms)
   ends = np.zeros(6)
-  for geom, centre, matrix in zip((one, other), centres, matrices, strict=True):
+  for geom, centre, matrix in zip(geoms, centres, matrices, strict=True):
     data.geom_xpos[geom], data.geom_xmat[geom] = centre, matrix
   for nudge in _NUDGES:
-    data.geom_xpos[one] = centres[0] + nudge
-    found = mujoco.mj_geomDistance(model, data, one, other, limit, ends)
+    data.geom_xpos[first] = centres[0] + nudge
+    gap = mujoco.mj_geomDistance(model, data, first, second, limit, ends)
     # MuJoCo also returns exactly 0 if it fails to compute the distance.
-    if found:
-      return float(found), (ends[:3] + ends[3:]) / 2
+    if gap:
+      return float(gap), (ends[:3] + ends[3:]) / 2
   return 0.0, np.array(centres[0])

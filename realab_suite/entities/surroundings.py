@@ -273,10 +273,10 @@ class Surroundings:
       self._physics = physics
     bound = self._bound
     # Most often nothing has moved, and bytes are compared fastest.
-    seen = bound.mocap_pos.tobytes() + bound.mocap_quat.tobytes()
-    if seen == self._seen:
+    pose_bytes = bound.mocap_pos.tobytes() + bound.mocap_quat.tobytes()
+    if pose_bytes == self._seen:
       return
-    self._seen = seen
+    self._seen = pose_bytes
     poses = np.concatenate([bound.mocap_pos, bound.mocap_quat], axis=-1)
     if poses.shape != self._poses.shape:
       self._poses = np.full_like(poses, np.nan)
