@@ -147,12 +147,12 @@ class CleanCalls:
         since the observation.
       observation: Observation that the agent's action responds to.
     """
-    seen = {}
+    sight = {}
     for name in self._read_by_agent:
       port, key = self._ports[name], f'registers/{name}'
       applied, clean = port.applied(physics), port.clean(physics)
-      seen[key] = observation[key][()], applied, clean, self._tolerances[name]
-    return seen
+      sight[key] = observation[key][()], applied, clean, self._tolerances[name]
+    return sight
 
   def repeat(
       self,
@@ -186,12 +186,12 @@ class CleanCalls:
       differs = np.asarray(inputs.observation[key] != value)
       own_axes = tuple(range(np.ndim(inputs.episode_start), differs.ndim))
       needs = needs | differs.any(axis=own_axes)
-    seen = {}
+    contents = {}
     for read in call.reads:
       applied = self._ports[read.register].applied(physics)
       most = self._tolerances[read.register]
-      seen[read.register] = read.reading, applied, read.clean, most
-    for content in (*call.sight.values(), *seen.values()):
+      contents[read.register] = read.reading, applied, read.clean, most
+    for content in (*call.sight.values(), *contents.values()):
       needs = needs | is_disturbed(*content)
     if where is not None:
       needs = needs & where
@@ -199,7 +199,7 @@ class CleanCalls:
       return None
     shown, readings = (
         {name: undisturbed(*of) for name, of in group.items()}
-        for group in (call.sight, seen)
+        for group in (call.sight, contents)
     )
     clean = Inputs(
         {**inputs.observation, **shown, **call.ideal},
@@ -296,17 +296,17 @@ def _contents(
   if not np.ndim(where):
     writes, clean, is_known = _call(provider, inputs, state[CLEAN], guard)
     is_same = is_known and trees.are_equal(clean, without[ACTUAL])
-    found = {**without, CLEAN: clean, DIFFERS: np.bool_(not is_same)}
-    return Contents(where, writes, found)
+    next_state = {**without, CLEAN: clean, DIFFERS: np.bool_(not is_same)}
+    return Contents(where, writes, next_state)
   rows = np.flatnonzero(where)
-  some = Inputs(*(trees.taken(part, rows) for part in inputs))
+  inputs_of_rows = Inputs(*(trees.taken(part, rows) for part in inputs))
   before = trees.taken(state[CLEAN], rows)
-  writes, clean, is_known = _call(provider, some, before, guard)
+  writes, clean, is_known = _call(provider, inputs_of_rows, before, guard)
   differs = np.array(without[DIFFERS])
   differs[rows] = ~is_known | trees.differing(
       clean, trees.taken(without[ACTUAL], rows)
   )
-  found = {
+  next_state = {
       ACTUAL: without[ACTUAL],
       CLEAN: trees.put(without[CLEAN], rows, clean),
       DIFFERS: differs,
@@ -314,7 +314,7 @@ def _contents(
   return Contents(
       where,
       {name: _spread(one, rows, len(where)) for name, one in writes.items()},
-      found,
+      next_state,
   )
 
 
@@ -391,26 +391,26 @@ def _one_by_one(
 ) -> tuple[dict[str, provider_results.RequestedWrite], Any, Any]:
   """Calls a provider for each world alone, so that one failure stays one."""
   number = len(inputs.episode_start)
-  found: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+  pairs: dict[str, tuple[np.ndarray, np.ndarray]] = {}
   is_known = np.zeros(number, bool)
   for world in range(number):
     row = np.array([world])
-    one = Inputs(*(trees.taken(part, row) for part in inputs))
-    writes, following, known = _call(
-        provider, one, trees.taken(state, row), guard
+    inputs_of_world = Inputs(*(trees.taken(part, row) for part in inputs))
+    writes, following, mask = _call(
+        provider, inputs_of_world, trees.taken(state, row), guard
     )
-    [is_known[world]] = known
+    [is_known[world]] = mask
     state = trees.put(state, row, following)
     for name, write in writes.items():
       nothing = np.zeros(number), np.zeros(number, bool)
-      value, where = found.setdefault(name, nothing)
+      value, where = pairs.setdefault(name, nothing)
       value[world] = write.value[0]
       where[world] = write.where is None or write.where[0]
-  every = {
+  all_writes = {
       name: provider_results.RequestedWrite(*pair)
-      for name, pair in found.items()
+      for name, pair in pairs.items()
   }
-  return every, state, is_known
+  return all_writes, state, is_known
 
 
 def _spread(

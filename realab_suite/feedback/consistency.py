@@ -86,13 +86,13 @@ def _expect_role(
 
 def _refuse_duplicates(where: str, names: Sequence[str]) -> None:
   """Refuses a list that names a register twice."""
-  seen: set[str] = set()
+  listed: set[str] = set()
   for name in names:
-    if name in seen:
+    if name in listed:
       raise ValueError(
           f'{where}: register {name!r} is listed twice; must be listed once'
       )
-    seen.add(name)
+    listed.add(name)
 
 
 def _refuse_equal_ports(design: Any) -> None:
@@ -184,14 +184,14 @@ def _expect_actions(design: Any, where: str, name: str) -> None:
   """Checks that a register can store the index of every action."""
   if design.action_set is None:
     return
-  known = action_sets.get(design.action_set.name, design.action_set.version)
-  last = len(known) - 1
+  actions = action_sets.get(design.action_set.name, design.action_set.version)
+  last = len(actions) - 1
   low, high = design.ports[name].range
   if not low <= 0 <= last <= high:
     raise ValueError(
         f'registers.{name}.range: {[low, high]} excludes actions of'
-        f' {known.name} v{known.version}, whose indices {where} uses; allowed'
-        f' are ranges that contain [0, {last}]'
+        f' {actions.name} v{actions.version}, whose indices {where} uses;'
+        f' allowed are ranges that contain [0, {last}]'
     )
 
 
@@ -241,14 +241,14 @@ def _check_learner(design: Any) -> None:
     if design.learner is not None:
       objectives.refuse_misspelling(design.learner.kind)
     return
-  for names, what, allowed in (
+  for names, description, allowed in (
       (objective.registers, 'register that agents read', _READ_BY_AGENTS),
       (objective.queries or (), 'query register', ('query',)),
   ):
-    known = design.names(*allowed)
+    ports = design.names(*allowed)
     for name in names:
-      if name not in known:
+      if name not in ports:
         raise ValueError(
-            f'learner: {messages.quote(name)} is not a {what}'
-            f'{messages.did_you_mean(name, known)}; must be one of {known}'
+            f'learner: {messages.quote(name)} is not a {description}'
+            f'{messages.did_you_mean(name, ports)}; must be one of {ports}'
         )

@@ -201,8 +201,12 @@ class FeedbackMechanism(modelled.ModelledEntity):
   @property
   def own_senses(self) -> set[str]:
     """Names of the senses that providers have, whatever the agent has."""
-    own = [p for p in self._design.providers if p.senses == providers.OWN]
-    return {name for provider in own for name in provider.sensed}
+    return {
+        name
+        for provider in self._design.providers
+        if provider.senses == providers.OWN
+        for name in provider.sensed
+    }
 
   @property
   def read_by_agent(self) -> list[str]:
@@ -211,18 +215,18 @@ class FeedbackMechanism(modelled.ModelledEntity):
 
   def _targets(self, names: Sequence[str]) -> list[_Target]:
     """Returns the writes that set the ports of these names, in their order."""
-    found: dict[str, _Target] = {}
+    targets: dict[str, _Target] = {}
     for name in names:
       register = self._design.register_of(name)
-      if register not in found:
-        own = self._design.ports_by_register[register]
-        found[register] = _Target(
+      if register not in targets:
+        port_names = self._design.ports_by_register[register]
+        targets[register] = _Target(
             self._registers[register],
-            [self._ports[one] for one in own],
-            own,
-            [names.index(one) for one in own],
+            [self._ports[one] for one in port_names],
+            port_names,
+            [names.index(one) for one in port_names],
         )
-    return [*found.values()]
+    return [*targets.values()]
 
   def attach_to(self, root: composer.Entity) -> None:
     """Attaches the mechanism and its registers to the root entity of a task.
@@ -308,7 +312,7 @@ class FeedbackMechanism(modelled.ModelledEntity):
           )
         values = [functions[name] for name in names]
         register.start_with(_stacked(values) if register.PORTS else values[0])
-    found: dict[str, tuple[str, measurements.Measure]] = {}
+    pairs: dict[str, tuple[str, measurements.Measure]] = {}
     for i, spec in enumerate(self._design.meters):
       asked = measurements.AskedRegisters(self._registers)
       world = measurements.World(
@@ -322,9 +326,9 @@ class FeedbackMechanism(modelled.ModelledEntity):
       self._asked.append(asked)
       title, measure = measurements.connect(spec.measures, world)
       asked.close()
-      found[spec.writes] = f'meter:{title}', measure
-    for target in self._targets([*found]):
-      writers, measures = zip(*map(found.get, target.names), strict=True)
+      pairs[spec.writes] = f'meter:{title}', measure
+    for target in self._targets([*pairs]):
+      writers, measures = zip(*map(pairs.get, target.names), strict=True)
       meter = meters.Meter(_joint(measures), target.register, self._mjcf_root)
       self._phases.meters.append((writers, meter, target))
     self._is_connected = True

@@ -157,12 +157,12 @@ def why_unknown(defence: Any) -> str | None:
   if not isinstance(defence, Mapping):
     return None
   kind: Any = defence.get('kind')
-  known = sorted({*PAYMENTS, *DEFENCES})
-  if isinstance(kind, str) and kind in known:
+  kinds = sorted({*PAYMENTS, *DEFENCES})
+  if isinstance(kind, str) and kind in kinds:
     return None
   return (
       f'has the defence {messages.quote(kind)}, which is not registered'
-      f'{messages.did_you_mean(kind, known)}; known are {known}, and --import'
+      f'{messages.did_you_mean(kind, kinds)}; known are {kinds}, and --import'
       ' names the module of another'
   )
 
@@ -187,8 +187,8 @@ def _payment(defence: Any, reward: str) -> Payment | str:
     return PAYMENTS.get(kind)(defence, reward)
   if unknown := why_unknown(defence):
     return unknown
-  one = validation.validate(DEFENCES.get(kind), defence, 'learner.defence')
-  if (weights := one.pays(reward)) is None:
+  spec = validation.validate(DEFENCES.get(kind), defence, 'learner.defence')
+  if (weights := spec.pays(reward)) is None:
     return (
         f'has the defence {kind!r}, which declares no sum of readings that it'
         ' pays (`pays` in docs/your_own.md)'
@@ -198,7 +198,7 @@ def _payment(defence: Any, reward: str) -> Payment | str:
         f'defence {kind!r}: pays {messages.quote(weights)}; must map to weights'
         ' by the name of the register, one of which is not 0'
     )
-  return Payment(weights, tuple(one.queries) or None)
+  return Payment(weights, tuple(spec.queries) or None)
 
 
 @OBJECTIVES.add('policy_gradient')
@@ -273,12 +273,12 @@ def refuse_misspelling(kind: str) -> None:
   Raises:
     ValueError: If it is unknown, and like a known one.
   """
-  known = sorted({*OBJECTIVES, *LEARNERS})
-  hint = messages.did_you_mean(kind, known, _MISSPELT)
-  if hint and kind not in known:
+  kinds = sorted({*OBJECTIVES, *LEARNERS})
+  hint = messages.did_you_mean(kind, kinds, _MISSPELT)
+  if hint and kind not in kinds:
     raise ValueError(
         f'learner {messages.quote(kind)} is unknown{hint}; known are'
-        f' {known}; a learner of your own that has such a name declares an'
+        f' {kinds}; a learner of your own that has such a name declares an'
         ' `objective`, or --import names its module'
     )
 

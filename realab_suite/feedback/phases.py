@@ -273,9 +273,9 @@ class Phases:
       ]
       if acts is not None:
         reads = [read._replace(where=acts) for read in reads]
-      seen, ideal = provider.see(observation)
+      view, ideal = provider.see(observation)
       inputs = clean_contents.Inputs(
-          {**seen, **ideal} if provider.is_secure else seen,
+          {**view, **ideal} if provider.is_secure else view,
           {read.register: read.reading for read in reads},
           is_start,
           keys_of_step[i],

@@ -48,9 +48,9 @@ def checked(
   # Almost all are dicts, which the check for mappings is slow for.
   is_mapping = type(values) is dict or isinstance(values, Mapping)
   if not is_mapping or not values.keys() <= set(provider.writes):
-    given = sorted(map(str, values)) if is_mapping else values
+    names = sorted(map(str, values)) if is_mapping else values
     raise errors.FeedbackProviderError(
-        f'returned writes {messages.quote(given)}; it declares writes to'
+        f'returned writes {messages.quote(names)}; it declares writes to'
         f' {sorted(provider.writes)}; must be a mapping from their names to'
         ' values'
     )
@@ -76,23 +76,23 @@ def joint(
   Raises:
     FeedbackProviderError: If only some of the ports are written in a world.
   """
-  own = [writes[name] for name in names if name in writes]
-  if not own:
+  parts = [writes[name] for name in names if name in writes]
+  if not parts:
     return None
-  mask = own[0].where
-  if len(own) < len(names) or not all(
+  mask = parts[0].where
+  if len(parts) < len(names) or not all(
       np.array_equal(
           True if one.where is None else one.where,
           True if mask is None else mask,
       )
-      for one in own
+      for one in parts
   ):
     raise errors.FeedbackProviderError(
         f'{where} wrote {[name for name in names if name in writes]}, or in'
         f' different worlds; allowed in each world are all of {list(names)}, or'
         ' none, because one write sets them all'
     )
-  return RequestedWrite(np.stack([one.value for one in own], axis=-1), mask)
+  return RequestedWrite(np.stack([one.value for one in parts], axis=-1), mask)
 
 
 def _checked_write(

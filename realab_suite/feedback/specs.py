@@ -348,10 +348,10 @@ class DesignSpec(validation.Spec):
 
   @functools.cached_property
   def _objective(self) -> tuple[objectives.ObjectiveSpec | None, str]:
-    found, reason = objectives.of_learner(self.learner)
-    if found and found.kind == objectives.AGREEMENT and not self.action_set:
+    spec, reason = objectives.of_learner(self.learner)
+    if spec and spec.kind == objectives.AGREEMENT and not self.action_set:
       return None, 'an agreement needs actions with indices: an action_set'
-    return found, reason
+    return spec, reason
 
   def integer_queries(self) -> list[str]:
     """Returns the names of the query registers for indices of actions.
@@ -377,13 +377,13 @@ class DesignSpec(validation.Spec):
     """
     where = f'design {self.name!r}'
     try:
-      found = tuple(one.in_world(solver) for one in self.providers)
+      adapted = tuple(one.in_world(solver) for one in self.providers)
     except errors.SpecError as error:
       raise errors.SpecError(f'{where}: {error}') from error
-    if found == self.providers:
+    if adapted == self.providers:
       return self
     return validation.validate(
-        DesignSpec, {**self.to_source(), 'providers': found}, where
+        DesignSpec, {**self.to_source(), 'providers': adapted}, where
     )
 
   def to_source(self) -> dict[str, Any]:

@@ -40,16 +40,16 @@ class Distance(base.Measurement):
   def connect(self, world: base.World) -> base.Measure:
     if self.start == self.to:
       raise world.error('to', f"{self.to!r}; must be another name than 'from'")
-    one, other = world.part('from', self.start), world.part('to', self.to)
+    start, end = world.part('from', self.start), world.part('to', self.to)
     num_axes = len(self.axes)
 
     def measure(physics: protocols.Physics) -> np.ndarray:
-      starts = one.positions(physics)[..., :, np.newaxis, :num_axes]
-      ends = other.positions(physics)[..., np.newaxis, :, :num_axes]
+      starts = start.positions(physics)[..., :, np.newaxis, :num_axes]
+      ends = end.positions(physics)[..., np.newaxis, :, :num_axes]
       offsets = starts - ends
       distances = np.sqrt((offsets * offsets).sum(axis=-1))
-      is_there = _present(one, physics)[..., :, np.newaxis]
-      is_there = is_there & _present(other, physics)[..., np.newaxis, :]
+      is_there = _present(start, physics)[..., :, np.newaxis]
+      is_there = is_there & _present(end, physics)[..., np.newaxis, :]
       nearest = np.where(is_there, distances, np.inf).min(axis=(-2, -1))
       return np.where(np.isinf(nearest), self.absent, nearest)[()]
 

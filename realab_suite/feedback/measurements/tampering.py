@@ -85,25 +85,25 @@ class Sight(validation.Model):
       (carrier,) = world.body('eye', self.eye).bodies
 
     def are_seen(physics: protocols.Physics) -> np.ndarray:
-      found = physics.bind(blocks)
-      places = np.array(found.xpos)
-      yaw, own = np.radians(self.heading), -1
+      bound_blocks = physics.bind(blocks)
+      places = np.array(bound_blocks.xpos)
+      yaw, carrier_id = np.radians(self.heading), -1
       if carrier is None:
         eye = np.zeros_like(places[..., 0, :]) + self.eye
       else:
         bound = physics.bind(carrier)
         eye, turn = np.array(bound.xpos), bound.xmat
-        own = physics.model.name2id(carrier.full_identifier, 'body')
+        carrier_id = physics.model.name2id(carrier.full_identifier, 'body')
         yaw = yaw + np.arctan2(turn[..., 3], turn[..., 0])[..., np.newaxis]
       ways = places - eye[..., np.newaxis, :]
       distances = np.linalg.norm(ways, axis=-1)
       ways /= distances[..., np.newaxis].clip(1e-9)
-      _, hit = rays.cast(physics, eye, ways, own)
+      _, hit = rays.cast(physics, eye, ways, carrier_id)
       aside = np.arctan2(ways[..., 1], ways[..., 0]) - yaw
       aside = (aside + np.pi) % (2 * np.pi) - np.pi
       is_near = distances <= self.range
       is_ahead = np.abs(aside) <= np.radians(self.angle) / 2 + 1e-9
-      return is_near & is_ahead & (hit == found.element_id)
+      return is_near & is_ahead & (hit == bound_blocks.element_id)
 
     return are_seen
 
@@ -136,8 +136,8 @@ class Detector(base.Measurement):
     registers = [world.register('of', name) for name in self.of]
 
     def are_moved(physics: protocols.Physics) -> np.ndarray:
-      found = [register.displacements(physics) for register in registers]
-      return np.concatenate(found, axis=-1) > self.tolerance
+      shifts = [register.displacements(physics) for register in registers]
+      return np.concatenate(shifts, axis=-1) > self.tolerance
 
     def ideal(physics: protocols.Physics) -> np.ndarray:
       return np.asarray(are_moved(physics).any(axis=-1), np.float64)[()]
@@ -149,7 +149,7 @@ class Detector(base.Measurement):
     are_seen = self.sight.connect(inside, blocks)
 
     def measured(physics: protocols.Physics) -> np.ndarray:
-      found = (are_moved(physics) & are_seen(physics)).any(axis=-1)
-      return np.asarray(found, np.float64)[()]
+      is_detected = (are_moved(physics) & are_seen(physics)).any(axis=-1)
+      return np.asarray(is_detected, np.float64)[()]
 
     return meters.Instrument(measured, ideal)

@@ -120,15 +120,15 @@ class Provider(validation.Model):
       SpecError: If the provider needs a solver, and there is none.
     """
     data = self.model_dump()
-    found = _with_solver(data, solver)
-    if found == data:
+    fields = _with_solver(data, solver)
+    if fields == data:
       return self
     if solver is None:
       raise errors.SpecError(
           f'{self.kind} names {policies.SOLVER!r}, but this world has none;'
           ' name other policies'
       )
-    return type(self).model_validate(found)
+    return type(self).model_validate(fields)
 
   @property
   def is_repeatable(self) -> bool:
@@ -210,9 +210,9 @@ def _with_solver(part: Any, solver: str | None) -> Any:
   """Returns fields of a provider, at any depth, with the name of a solver."""
   if not isinstance(part, Mapping):
     return part
-  found = {key: _with_solver(value, solver) for key, value in part.items()}
-  if found.get('policy') == policies.SOLVER:
-    found['policy'] = solver
-  if found.get('value_function') == policies.SOLVER_APPROVAL:
-    found['options'] = {'policy': solver, **(found.get('options') or {})}
-  return found
+  fields = {key: _with_solver(value, solver) for key, value in part.items()}
+  if fields.get('policy') == policies.SOLVER:
+    fields['policy'] = solver
+  if fields.get('value_function') == policies.SOLVER_APPROVAL:
+    fields['options'] = {'policy': solver, **(fields.get('options') or {})}
+  return fields

@@ -129,8 +129,8 @@ class Inspection(base.Provider):
   @property
   def detectors(self) -> tuple[str, ...]:
     """Names of the registers of detectors."""
-    others = (*(self.pays.reads if self.pays else ()), self.suspects)
-    return tuple(name for name in self.reads[:-1] if name not in others)
+    other_names = (*(self.pays.reads if self.pays else ()), self.suspects)
+    return tuple(name for name in self.reads[:-1] if name not in other_names)
 
   @property
   def action_queries(self) -> tuple[str, ...]:
@@ -173,9 +173,9 @@ class Inspection(base.Provider):
       )
     initial = budget.initial
     if isinstance(initial, str) or initial < self.price:
-      given = initial if isinstance(initial, str) else f'{initial:g}'
+      amount = initial if isinstance(initial, str) else f'{initial:g}'
       raise ValueError(
-          f'registers.{name}.initial: a budget of {given}; must be at least'
+          f'registers.{name}.initial: a budget of {amount}; must be at least'
           f' the price of one inspection, {self.price:g}, as a number'
       )
     if budget.range[0] > 0:
@@ -235,26 +235,28 @@ class Inspection(base.Provider):
       reading = np.array(readings[self.suspects])
       before = np.where(start, reading, state['reading'])
       asks = asks & (self._score(reading, before) > self.above)
-    seen = np.stack(
+    hits = np.stack(
         [readings[name] > _SEEN for name in self.detectors], axis=-1
     )
     if self.probability < 1 or self.false_positives or self.false_negatives:
-      draws = random_keys.uniform(key + _OTHER_STREAM, (1 + seen.shape[-1],))
+      draws = random_keys.uniform(key + _OTHER_STREAM, (1 + hits.shape[-1],))
       asks = asks & (draws[..., 0] < self.probability)
       errs = draws[..., 1:]
-      seen = np.where(
-          seen, errs >= self.false_negatives, errs < self.false_positives
+      hits = np.where(
+          hits, errs >= self.false_negatives, errs < self.false_positives
       )
-    left = np.where(asks & seen.any(axis=-1), self.lasts, left)
+    left = np.where(asks & hits.any(axis=-1), self.lasts, left)
     alarm = (left > 0).astype(float)
     writes: dict[str, Any] = {}
     paid = state['pays']
     if self.pays is not None:
-      own = {name: readings[name] for name in self.pays.reads}
-      some, paid = self.pays.step(observation, own, episode_start, key, paid)
-      writes |= some
-      if (name := self.writes[0]) in some:
-        writes[name] = _less(some[name], self.penalty * alarm)
+      pay_readings = {name: readings[name] for name in self.pays.reads}
+      pay_writes, paid = self.pays.step(
+          observation, pay_readings, episode_start, key, paid
+      )
+      writes |= pay_writes
+      if (name := self.writes[0]) in pay_writes:
+        writes[name] = _less(pay_writes[name], self.penalty * alarm)
     number = len(self.pays.writes) if self.pays else 0
     writes |= dict.fromkeys(self.writes[number:-1], alarm)
     writes[self.writes[-1]] = budget - self.price, np.asarray(asks)

@@ -44,10 +44,10 @@ def check_clip(design: Any, register: str, clip: int) -> None:
   defence = learner.get('defence')
   if learner.get('reward') != register or not isinstance(defence, Mapping):
     return
-  if (given := defence.get('clip', clip)) != clip:
+  if (learner_clip := defence.get('clip', clip)) != clip:
     raise ValueError(
-        f'learner.defence.clip: {messages.quote(given)}; must be that of the'
-        f' comparisons, {clip}'
+        f'learner.defence.clip: {messages.quote(learner_clip)}; must be that of'
+        f' the comparisons, {clip}'
     )
 
 
