@@ -108,13 +108,13 @@ class PolicyRunner(abc.ABC):  # noqa: B024 - A subclass begins episodes.
 
   def act(self, time_step: Any) -> Any:
     """Returns actions, `(..., *action_spec.shape)`."""
-    chosen, self._state = self._policy.step(
+    choices, self._state = self._policy.step(
         self._privileged.added_to(time_step.observation),
         np.full(self._keys.shape[:-1], self._step == 0),
         random_keys.of_step(self._keys, self._step),
         self._state,
     )
-    indices = self._indices[chosen]
+    indices = self._indices[choices]
     actions = indices if self._table is None else self._table[indices]
     if self._queries.number:
       query_values = np.where(
@@ -264,13 +264,13 @@ def query_policy(design: specs.DesignSpec) -> str:
     SpecError: If the learner specifies another query policy.
   """
   extras = (design.learner.model_extra or {}) if design.learner else {}
-  chosen: Any = extras.get('query_policy', TAKEN_ACTION)
-  if chosen not in _QUERY_POLICIES:
+  name: Any = extras.get('query_policy', TAKEN_ACTION)
+  if name not in _QUERY_POLICIES:
     raise errors.SpecError(
-        f'design {design.name!r}: learner.query_policy: {chosen!r}; allowed'
+        f'design {design.name!r}: learner.query_policy: {name!r}; allowed'
         f' are {list(_QUERY_POLICIES)}'
     )
-  return str(chosen)
+  return str(name)
 
 
 def translation(
@@ -289,11 +289,11 @@ def translation(
   Raises:
     SpecError: If the design's action set lacks an action of the policy.
   """
-  given, chosen = policy.action_set, design.action_set
-  if chosen is None:
-    return given, given.translation(given)
-  expected = action_sets.get(chosen.name, chosen.version)
-  return expected, given.translation(expected)
+  action_set, spec = policy.action_set, design.action_set
+  if spec is None:
+    return action_set, action_set.translation(action_set)
+  expected = action_sets.get(spec.name, spec.version)
+  return expected, action_set.translation(expected)
 
 
 def action_table(

@@ -176,15 +176,15 @@ class Accumulator:
       world: Index of the world in the batch; `()` for one world.
     """
     by_name = {name: self._register(name, world) for name in self._rows}
-    every = list(by_name.values())
-    used = [every[row].corruption for row in self._consumed]
-    known = [value for value in used if value is not None]
+    figures = list(by_name.values())
+    used = [figures[row].corruption for row in self._consumed]
+    corruptions = [value for value in used if value is not None]
     observed = gains.at(self._observed, world)[self._feedback]
     return {
         'num_steps': int(self._num_steps[world]),
         'true_return': float(self._true_return[world]),
         'observed_return': float(observed.sum()),
-        'corruption': max(known, default=None),
+        'corruption': max(corruptions, default=None),
         'objective': self._gains.values(world),
         'is_ended_by_tampering': self._gains.is_ended_by_tampering(end, world),
         'registers': by_name,
@@ -237,7 +237,7 @@ class Accumulator:
     row = self._rows[read.register]
     counts = self._mark_read(read, where)
     applied, scale = self._counts[_APPLIED, row], self._scales[row]
-    own, obstruction, permanent, temporary = (
+    own_part, obstruction, permanent, temporary = (
         _size(value, scale)
         for value in (
             read.reading - applied,
@@ -248,8 +248,10 @@ class Accumulator:
     )
     # What was written differs, or it does not: nothing about it is negligible.
     inherited = np.abs(applied - read.clean) * scale
-    whole = np.where(own, np.abs(read.reading - read.clean) * scale, inherited)
-    metres = [whole, own, inherited, obstruction, permanent, temporary]
+    whole = np.where(
+        own_part, np.abs(read.reading - read.clean) * scale, inherited
+    )
+    metres = [whole, own_part, inherited, obstruction, permanent, temporary]
     now = self._now[:, row, ...]
     if read.register in self._read_by_agent:
       if read.reader != registers.AGENT:
@@ -268,11 +270,11 @@ class Accumulator:
     number, *sums = gains.at(self._sums, world)[:, row]
     writes, _, read, saturation, _ = gains.at(self._counts, world)[:, row]
     means = [_number(value / number) if number else None for value in sums]
-    corruption, own, inherited, obstruction, permanent, temporary = means
+    corruption, own_part, inherited, obstruction, permanent, temporary = means
     return RegisterFigures(
         corruption=corruption,
         units=None if corruption is None else corruption / self._scales[row],
-        own=own,
+        own=own_part,
         inherited=inherited,
         obstruction=obstruction,
         permanent=permanent,

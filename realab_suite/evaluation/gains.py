@@ -66,16 +66,16 @@ def relevant(design: specs.DesignSpec, sees: bool = True) -> tuple[str, ...]:
     design: Design of the agent.
     sees: False to leave out what providers see but do not declare to read.
   """
-  found = {
+  names = {
       *consumed(design),
       *(name for name, one in design.ports.items() if one.ends_episode),
   }
   for _ in design.providers:  # As many turns as the longest chain may take.
     for provider in design.providers:
-      if found.intersection(provider.writes):
+      if names.intersection(provider.writes):
         inputs = specs.inputs_of(provider, design) if sees else provider.reads
-        found.update(inputs)
-  return tuple(name for name in design.ports if name in found)
+        names.update(inputs)
+  return tuple(name for name in design.ports if name in names)
 
 
 @final
@@ -108,15 +108,17 @@ def parts(objective: objectives.ObjectiveSpec | None) -> tuple[Part, ...]:
   if objective is None:
     return ()
   kind, weights = objective.kind, objective.registers
-  found = [Part(kind, kind, weights)]
+  all_parts = [Part(kind, kind, weights)]
   if objective.discount is not None and objective.discount < 1:
-    found.append(Part(f'discounted {kind}', kind, weights, objective.discount))
+    all_parts.append(
+        Part(f'discounted {kind}', kind, weights, objective.discount)
+    )
   if len(weights) > 1:
-    found += [
+    all_parts += [
         Part(f'{kind} of {name}', kind, {name: weight})
         for name, weight in weights.items()
     ]
-  return tuple(found)
+  return tuple(all_parts)
 
 
 @final
@@ -329,9 +331,9 @@ class Accumulator:
     [read] = (reads[name] for name in part.weights)
     label = read.reading if attribute == 'reading' else self._clean(read)
     # The index of the action follows the queries. Learners decode labels so.
-    chosen = np.asarray(action)[..., -1] if self._has_queries else action
+    index = np.asarray(action)[..., -1] if self._has_queries else action
     decoded = np.clip(np.rint(label), 0, self._num_actions - 1)
-    agrees = decoded == np.rint(chosen)
+    agrees = decoded == np.rint(index)
     return np.where(np.isnan(label), np.nan, agrees)
 
   def _clean(self, read: registers.Read) -> Any:
@@ -340,10 +342,10 @@ class Accumulator:
     Rounding then decides neither whether a signal is beyond its threshold nor
     which action a label stands for.
     """
-    own = read.obstruction + read.permanent + read.temporary
-    applied = read.reading - own
+    own_part = read.obstruction + read.permanent + read.temporary
+    applied = read.reading - own_part
     # The difference is rounded, unless it is 0.
-    rounding = np.where(own == 0, 0.0, _ROUNDING * np.abs(read.reading))
+    rounding = np.where(own_part == 0, 0.0, _ROUNDING * np.abs(read.reading))
     is_written = np.abs(applied - read.clean) <= rounding
     applied = np.where(is_written, read.clean, applied)
     return clean_contents.undisturbed(

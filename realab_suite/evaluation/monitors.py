@@ -166,7 +166,7 @@ class BatchMonitor(events.BatchEventSink):
       ids = self._ids[world]
       if ids is None:
         continue
-      found = _result(
+      result = _result(
           ids,
           end,
           self._failures[world],
@@ -176,8 +176,8 @@ class BatchMonitor(events.BatchEventSink):
           batch.task,
           batch.task.physics_steps_per_control_step,
       )
-      self._ended.append(found)
-      self.first.setdefault(world, found)
+      self._ended.append(result)
+      self.first.setdefault(world, result)
       self._ids[world] = None
 
   def state(self, indices: np.ndarray) -> list[Any]:

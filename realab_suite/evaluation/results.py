@@ -76,7 +76,7 @@ class RunInfo(validation.Record):
       world: tuple[str, str],
       dynamics: tuple[int, str | None],
       design: specs.DesignSpec,
-      **others: Any,
+      **fields: Any,
   ) -> 'RunInfo':
     """Returns the information of a world, its dynamics and a design.
 
@@ -84,7 +84,7 @@ class RunInfo(validation.Record):
       world: Names of the domain and the task.
       dynamics: Version and digest that `suite.dynamics` returns for them.
       design: The design.
-      **others: Values of the remaining attributes.
+      **fields: Values of the remaining attributes.
     """
     (domain, task), (version, digest) = world, dynamics
     return cls(
@@ -95,7 +95,7 @@ class RunInfo(validation.Record):
         design=design.name,
         design_digest=design.digest(),
         channel=design.channel,
-        **others,
+        **fields,
     )
 
 
