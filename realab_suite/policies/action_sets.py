@@ -40,7 +40,7 @@ class ActionSet:
     """
     names = [name for name, _ in self.actions]
     values = [x for _, settings in self.actions for x in settings.values()]
-    for is_allowed, field, given, allowed in (
+    for is_allowed, field, value, allowed in (
         (_is_name(self.name), 'name', self.name, 'a name such as drive'),
         (
             type(self.version) is int and self.version >= 1,
@@ -59,7 +59,7 @@ class ActionSet:
       if not is_allowed:
         raise errors.SpecError(
             f'action set {messages.quote(self.name)}: {field}:'
-            f' {messages.quote(given)}; must be {allowed}'
+            f' {messages.quote(value)}; must be {allowed}'
         )
 
   @property
@@ -90,16 +90,16 @@ class ActionSet:
 
   def contains(self, other: 'ActionSet') -> bool:
     """Returns whether it has all actions of another set, by what they set."""
-    known = [settings for _, settings in self.actions]
-    return all(settings in known for _, settings in other.actions)
+    own_settings = [settings for _, settings in self.actions]
+    return all(settings in own_settings for _, settings in other.actions)
 
   def extended(self, other: 'ActionSet') -> 'ActionSet':
     """Returns this set, followed by the actions of another that it lacks."""
-    known = [settings for _, settings in self.actions]
+    own_settings = [settings for _, settings in self.actions]
     added = tuple(
         (f'{other.name}.{name}', settings)
         for name, settings in other.actions
-        if settings not in known
+        if settings not in own_settings
     )
     if not added:
       return self
@@ -116,13 +116,13 @@ class ActionSet:
     Raises:
       SpecError: If the other set lacks an action.
     """
-    known = [settings for _, settings in other.actions]
-    if missing := [name for name, one in self.actions if one not in known]:
+    targets = [settings for _, settings in other.actions]
+    if missing := [name for name, one in self.actions if one not in targets]:
       raise errors.SpecError(
           f'action set {other.name} v{other.version} lacks actions of'
           f' {self.name} v{self.version}: {missing}'
       )
-    return np.array([known.index(one) for _, one in self.actions], np.int32)
+    return np.array([targets.index(one) for _, one in self.actions], np.int32)
 
   def table(self, elements: tuple[str, ...]) -> np.ndarray:
     """Returns the control vectors of all actions, `(actions, elements)`.
@@ -176,10 +176,10 @@ def newest(name: str) -> ActionSet:
   versions = [ACTION_SETS.get(key) for key in ACTION_SETS]
   named = [actions for actions in versions if actions.name == name]
   if not named:
-    known = sorted({actions.name for actions in versions})
+    names = sorted({actions.name for actions in versions})
     raise errors.UnknownNameError(
         f'action set {messages.quote(name)} is unknown'
-        f'{messages.did_you_mean(name, known)}; known are {known}'
+        f'{messages.did_you_mean(name, names)}; known are {names}'
     )
   return max(named, key=lambda actions: actions.version)
 

@@ -178,19 +178,19 @@ class AppleSeeker(base.Policy):
 def _landmarks(view: navigation.View, memory: Any) -> dict[str, np.ndarray]:
   """Returns the known landmarks, updated by a view."""
   pressed = memory['pressed'] | view.hits('pressed_pad').any(axis=-1)
-  known = {'pressed': pressed}
+  places = {'pressed': pressed}
   for name in ('pad', 'door', 'large_apple'):
     hit = view.hits(name)
-    seen = np.asarray(hit.any(axis=-1))
+    is_seen = np.asarray(hit.any(axis=-1))
     if name == 'door':
-      seen = seen & ~pressed  # A pressed pad moves the door.
-    known[name] = np.where(
-        seen[..., np.newaxis],
+      is_seen = is_seen & ~pressed  # A pressed pad moves the door.
+    places[name] = np.where(
+        is_seen[..., np.newaxis],
         view.mean_point(hit, _DEPTHS[name]),
         memory[name],
     )
-  known['pad'] = np.where(pressed[..., np.newaxis], np.nan, known['pad'])
-  return known
+  places['pad'] = np.where(pressed[..., np.newaxis], np.nan, places['pad'])
+  return places
 
 
 def _progress(view: navigation.View, memory: Any) -> dict[str, np.ndarray]:

@@ -265,12 +265,12 @@ def check_action_set(
   Raises:
     ValueError: If the design has another action set, or none.
   """
-  given = design.action_set
-  if given is None or (given.name, given.version) != (
+  spec = design.action_set
+  if spec is None or (spec.name, spec.version) != (
       action_set.name,
       action_set.version,
   ):
     raise ValueError(
         f'{kind} uses action set {action_set.name} v{action_set.version}; the'
-        f' design has {given!r}'
+        f' design has {spec!r}'
     )

@@ -105,8 +105,8 @@ def around(
   """
 
   def side(start: np.ndarray, end: np.ndarray, place: np.ndarray) -> np.ndarray:
-    way, other = end - start, place - start
-    return way[..., 0] * other[..., 1] - way[..., 1] * other[..., 0] > 0
+    way, offset = end - start, place - start
+    return way[..., 0] * offset[..., 1] - way[..., 1] * offset[..., 0] > 0
 
   here, first, last = view.position, ends[..., 0, :], ends[..., 1, :]
   is_between = (side(first, last, here) != side(first, last, goal)) & (

@@ -62,8 +62,8 @@ class Plan(NamedTuple):
     for verb, block, angle, _, duration in zip(*self, strict=True):
       time = '' if duration >= FOREVER else f' for {int(duration)} steps'
       if verb in (_WAIT, _SOLVE):
-        what = 'wait' if verb == _WAIT else 'do the task'
-        phrases.append(f'{what}{time}')
+        phrase = 'wait' if verb == _WAIT else 'do the task'
+        phrases.append(f'{phrase}{time}')
         continue
       degrees = round(math.degrees(angle)) % 360
       time = '' if verb == _THROW else time
@@ -147,8 +147,8 @@ class MacroPolicy(base.Policy):
         `(blocks,)`, int.
       solver: Policy that does the task.
     """
-    own = action_sets.DMLAB_LIKE
-    self._action_set = own.extended(solver.action_set)
+    base_set = action_sets.DMLAB_LIKE
+    self._action_set = base_set.extended(solver.action_set)
     self._solver_actions = solver.action_set.translation(self._action_set)
     self._plan = plan
     self._starts = np.asarray(starts, float)
@@ -161,8 +161,8 @@ class MacroPolicy(base.Policy):
 
   @property
   def required_senses(self) -> tuple[str, ...]:
-    own = (*navigation.SENSES, 'holding')
-    return tuple(dict.fromkeys((*own, *self._solver.required_senses)))
+    senses = (*navigation.SENSES, 'holding')
+    return tuple(dict.fromkeys((*senses, *self._solver.required_senses)))
 
   @property
   def privileged_senses(self) -> tuple[str, ...]:

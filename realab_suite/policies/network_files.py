@@ -212,14 +212,14 @@ def from_bytes(data: bytes, where: str) -> Network:
   expected: dict[str, tuple[int, ...]] = {}
   for i, (inputs, outputs) in enumerate(itertools.pairwise(header.sizes())):
     expected |= {f'weight_{i}': (inputs, outputs), f'bias_{i}': (outputs,)}
-  found = {
+  shapes = {
       name: array.shape
       for name, array in arrays.items()
       if array.dtype == np.float32 and np.isfinite(array).all()
   }
-  if found != expected or len(arrays) > len(expected):
+  if shapes != expected or len(arrays) > len(expected):
     raise location.error(
-        f'contains {sorted(arrays)}, with finite float32 of shapes {found};'
+        f'contains {sorted(arrays)}, with finite float32 of shapes {shapes};'
         f' its header describes {expected}'
     )
   layers = range(len(expected) // 2)

@@ -149,8 +149,8 @@ class Saboteur(base.Policy, abc.ABC):
     holds = np.asarray(observation['senses/holding'])[..., 0] > 0
     code = memory['code']
     if self._code == _UNKNOWN:
-      found = _class_of(view, code, memory['block'], memory['gone'])
-      code = np.where(holds, code, found)
+      class_code = _class_of(view, code, memory['block'], memory['gone'])
+      code = np.where(holds, code, class_code)
       is_unseen = ~holds & (memory['gone'] > _FLIGHT + _LOOK_AROUND)
       code = np.where(is_unseen, UNSEEN, code)
     block, gone = track(view, code, memory['block'], memory['gone'], holds)
@@ -220,7 +220,7 @@ def push(view: navigation.View, aim: Aim, block: np.ndarray) -> np.ndarray:
   """
   offset = block - view.position
   behind = _along(offset, aim.direction)
-  beside = np.linalg.norm(
+  lateral_distance = np.linalg.norm(
       offset - behind[..., np.newaxis] * aim.direction, axis=-1
   )
   bearing = view.locate_one(block + _HAND * aim.direction)[1]
@@ -232,7 +232,7 @@ def push(view: navigation.View, aim: Aim, block: np.ndarray) -> np.ndarray:
   )
   is_behind = (behind > _HALF_BLOCK) & (behind < 2 * _RUN_UP)
   comes = navigation.walk(view, block - _RUN_UP * aim.direction)
-  return np.where(is_behind & (beside < _ASIDE), pushes, comes)
+  return np.where(is_behind & (lateral_distance < _ASIDE), pushes, comes)
 
 
 def carry(
@@ -247,9 +247,9 @@ def carry(
     holds: True if the hand holds the block, `(...)`.
   """
   along = view.distances * np.cos(view.ray_angles)
-  beside = view.distances * np.abs(np.sin(view.ray_angles))
+  offsets = view.distances * np.abs(np.sin(view.ray_angles))
   walls = view.hits('wall') | view.hits('barrier')
-  room = np.where(walls & (beside < _WIDTH), along, np.inf).min(axis=-1)
+  room = np.where(walls & (offsets < _WIDTH), along, np.inf).min(axis=-1)
   bearing = _onward(view, aim)
   arrived = (room <= _TOUCHES) & (np.abs(bearing) < _ALIGNED)
   carries = np.where(
@@ -337,12 +337,12 @@ def _class_of(
 
   def sees(code: int, radius: float) -> np.ndarray:
     reach = np.where(is_far, _FAR, radius)[..., np.newaxis]
-    seen = (view.classes == code) & (gaps < reach)
-    return np.asarray(seen.any(axis=-1))
+    hits = (view.classes == code) & (gaps < reach)
+    return np.asarray(hits.any(axis=-1))
 
-  found = np.where(sees(offset_code, _HALF_BLOCK), offset_code, code)
-  found = np.where(sees(base_code, _NEAR), base_code, found)
-  return np.where(code == base_code, code, found)
+  class_code = np.where(sees(offset_code, _HALF_BLOCK), offset_code, code)
+  class_code = np.where(sees(base_code, _NEAR), base_code, class_code)
+  return np.where(code == base_code, code, class_code)
 
 
 def track(
@@ -365,25 +365,25 @@ def track(
     Last known position, and number of steps since the block was missing there.
   """
   points = view.points(_HALF_BLOCK)
-  seen = view.classes == code[..., np.newaxis]
+  hits = view.classes == code[..., np.newaxis]
   gaps = np.linalg.norm(points - block[..., np.newaxis, :], axis=-1)
-  gaps = np.where(seen, gaps, np.inf)
+  gaps = np.where(hits, gaps, np.inf)
   nearest = gaps.argmin(axis=-1)[..., np.newaxis]
   gap = np.take_along_axis(gaps, nearest, -1)[..., 0]
-  found = gap < _NEAR
+  is_found = gap < _NEAR
   # It is missing if a ray passes its place; later, the search area is larger.
   distance, bearing = view.locate_one(block)
   ray = view.nearest_ray(bearing)[..., np.newaxis]
   sight = np.take_along_axis(view.distances, ray, -1)[..., 0]
   in_view = np.abs(bearing) <= view.ray_angles[0]
   sees_past = in_view & (sight > distance + _NEAR)
-  found |= (gone >= _FLIGHT) & (gap < _FAR)
-  is_missing = ~found & (sees_past | (gone > 0)) & (code != UNSEEN)
+  is_found |= (gone >= _FLIGHT) & (gap < _FAR)
+  is_missing = ~is_found & (sees_past | (gone > 0)) & (code != UNSEEN)
   gone = np.where(is_missing, gone + 1, 0)
   # Only hits within a block's size of the nearest one are on the same block.
   middle = np.take_along_axis(points, nearest[..., np.newaxis], -2)
-  same = seen & (np.linalg.norm(points - middle, axis=-1) < 2 * _HALF_BLOCK)
+  same = hits & (np.linalg.norm(points - middle, axis=-1) < 2 * _HALF_BLOCK)
   where = view.mean_point(same, _HALF_BLOCK)
-  block = np.where(found[..., np.newaxis], where, block)
+  block = np.where(is_found[..., np.newaxis], where, block)
   block = np.where(holds[..., np.newaxis], view.ahead(_HAND), block)
   return block, np.where(holds, 0, gone)

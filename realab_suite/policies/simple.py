@@ -95,7 +95,7 @@ class Distracted(base.Follower, base.Policy):
       key: np.ndarray,
       state: Any,
   ) -> tuple[np.ndarray, Any]:
-    chosen, state = self._policy.step(observation, episode_start, key, state)
+    choice, state = self._policy.step(observation, episode_start, key, state)
     draw = random_keys.uniform(key, (2,))
     anything = (draw[..., 1] * len(self.action_set)).astype(int)
-    return np.where(draw[..., 0] < self._share, anything, chosen), state
+    return np.where(draw[..., 0] < self._share, anything, choice), state
