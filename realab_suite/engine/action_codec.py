@@ -210,9 +210,9 @@ def action_set_of(
     task: Task of this package, or a foreign one.
     design: Design whose action set counts; without one, that of the task.
   """
-  chosen = design.action_set
-  if chosen is not None:
-    return action_sets.get(chosen.name, chosen.version)
+  spec = design.action_set
+  if spec is not None:
+    return action_sets.get(spec.name, spec.version)
   if isinstance(task, base.Task):
     return task.ACTION_SET
   return action_sets.DMLAB_LIKE
@@ -228,10 +228,10 @@ def for_design(
     mechanism: Mechanism that runs the design.
   """
   design = mechanism.design
-  chosen = design.action_set
+  spec = design.action_set
   return ActionCodec(
       control_spec,
       [register.value_spec for register in mechanism.queries],
-      chosen and action_sets.get(chosen.name, chosen.version),
+      spec and action_sets.get(spec.name, spec.version),
       design.integer_queries(),
   )

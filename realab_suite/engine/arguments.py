@@ -77,13 +77,13 @@ def sources(given: Any, number: int, has_begun: np.ndarray) -> np.ndarray:
     SpecError: If it is anything else, or a world has not begun an episode.
   """
   indices(list(dict.fromkeys(given)), len(has_begun))
-  found = np.array(given)
-  if len(found) != number or not has_begun[found].all():
+  worlds = np.array(given)
+  if len(worlds) != number or not has_begun[worlds].all():
     raise errors.SpecError(
         f'sources: {messages.quote(given)}; must be {number} indices of'
         ' worlds that have begun an episode'
     )
-  return found
+  return worlds
 
 
 def senses(given: Any) -> tuple[str, ...] | None:

@@ -193,14 +193,14 @@ class BatchEnvironment:
     self._notify_of_ends(is_first & ~was_pending, events.End.ABANDONED)
     # If anything fails here, the next step begins all episodes.
     self._is_pending = np.ones(self._num_envs, bool)
-    others = self._observation
+    previous_observation = self._observation
     try:
       self._begin_episodes(is_first)
       reads = self._observe()
     except Exception:
       self._notify_of_ends(~(is_first | was_pending), events.End.ERROR)
       raise
-    for name, value in others.items():
+    for name, value in previous_observation.items():
       # MuJoCo has reset the state of worlds that failed.
       self._observation[name][~is_first] = value[~is_first]
     self._notify(
@@ -477,7 +477,7 @@ class BatchEnvironment:
     self._observation, reads = self._observer.observe(self._physics)
     return list(reads)
 
-  def _notify(self, ends: dict[int, events.End], **others: Any) -> None:
+  def _notify(self, ends: dict[int, events.End], **fields: Any) -> None:
     """Notifies the sinks of a control step; see `events.BatchStep`."""
     if not self._sinks:
       return
@@ -487,7 +487,7 @@ class BatchEnvironment:
         episode=self._episodes.copy(),
         ends=ends,
         initial=self._mechanism.phases.initial_writes(self._physics),
-        **others,
+        **fields,
     )
     for sink in self._sinks:
       sink.step_ended(step)

@@ -414,9 +414,9 @@ class _BatchBinding(_Binding):
     field, index = self.part(name)
     if name not in _STATE_FIELDS:
       self._physics.refresh()
-    found = field[:, index]
-    found.flags.writeable = False
-    return found
+    values = field[:, index]
+    values.flags.writeable = False
+    return values
 
   def mark_as_dirty(self) -> None:
     """Marks derived quantities as out of date."""

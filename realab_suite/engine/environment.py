@@ -493,8 +493,8 @@ class Environment(composer.Environment):
     self._host.begin_observing(self._physics_proxy)
 
   def _make_observation_updater(self) -> Any:
-    own = self._mechanism.own_senses
-    return self._host.make_updater(self._selected_senses, own)
+    own_senses = self._mechanism.own_senses
+    return self._host.make_updater(self._selected_senses, own_senses)
 
   def _recompile_physics(self) -> None:
     """Compiles the model into a physics class of this engine."""

@@ -203,8 +203,8 @@ class ForeignHost(hosts.Host):
       self, physics: hosts.SteppedPhysics, names: Collection[str]
   ) -> dict[str, np.ndarray]:
     del physics  # The updater has read it already.
-    seen = self._updater().get_observation()
-    return {n: np.array(seen[n]) for n in names if n in seen}
+    observation = self._updater().get_observation()
+    return {n: np.array(observation[n]) for n in names if n in observation}
 
   def begin_step(
       self, physics: hosts.SteppedPhysics, controls: np.ndarray
@@ -277,8 +277,8 @@ def check_start(
   """
   owners = clearance.owners(physics, mechanism.registers)
   model, contacts = physics.model, physics.data.ptr.contact
-  for (one, other), depth in zip(contacts.geom, -contacts.dist, strict=True):
-    block, body = (one, other) if one in owners else (other, one)
+  for (first, second), depth in zip(contacts.geom, -contacts.dist, strict=True):
+    block, body = (first, second) if first in owners else (second, first)
     if block not in owners or body in owners:
       continue
     if model.geom_type[body] == mujoco.mjtGeom.mjGEOM_HFIELD:

@@ -85,9 +85,9 @@ def refuse_in_batch(task: composer.Task, has_extra_hooks: bool) -> None:
 
 def with_start(task: base.Task) -> list[composer.Entity]:
   """Returns the entities of a task that have a hook for starts of episodes."""
-  own = composer.Entity.initialize_episode
+  default_hook = composer.Entity.initialize_episode
   return [
       entity
       for entity in task.root_entity.iter_entities()
-      if type(entity).initialize_episode is not own
+      if type(entity).initialize_episode is not default_hook
   ]

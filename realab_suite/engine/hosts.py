@@ -361,8 +361,8 @@ class WorldHost(Host):
       )
     for name, value in sensed.items():
       shape, dtype = self._expected[name]
-      given = getattr(value, 'shape', None), getattr(value, 'dtype', None)
-      if given != (shape, dtype):
+      signature = getattr(value, 'shape', None), getattr(value, 'dtype', None)
+      if signature != (shape, dtype):
         break
     raise errors.SpecError(
         f'{where}: {name!r} is {messages.quote(value)}; must be'

@@ -86,11 +86,11 @@ def check(
           f' {obstacles.names[j]!r}; place it elsewhere or narrow'
           ' its range'
       )
-    others = clearance.joined(placed) if placed else blocks.only([])
-    for i, j in space.meetings(blocks, others):
+    neighbours = clearance.joined(placed) if placed else blocks.only([])
+    for i, j in space.meetings(blocks, neighbours):
       raise errors.SpecError(
-          f'registers {others.names[j]!r} and {name!r} would be in each'
-          f" other's way: the first {others.describe(j)}, the second"
+          f'registers {neighbours.names[j]!r} and {name!r} would be in each'
+          f" other's way: the first {neighbours.describe(j)}, the second"
           f' {blocks.describe(i)}; place them apart or narrow their ranges'
       )
     placed.append(blocks)
@@ -218,15 +218,15 @@ class StartCheck:
         self._refuse(register, clearance.start(physics, register), bodies)
 
   def _refuse(
-      self, register: Any, blocks: clearance.Shapes, others: clearance.Shapes
+      self, register: Any, blocks: clearance.Shapes, obstacles: clearance.Shapes
   ) -> None:
     """Raises an error if a block of a register is inside something."""
-    for i, j in self._survey.space.meetings(blocks, others):
+    for i, j in self._survey.space.meetings(blocks, obstacles):
       raise composer.EpisodeInitializationError(
           f'design {self._design!r}: register {register.name!r}'
-          f' {blocks.describe(i)}, inside {others.names[j]!r} when the episode'
-          ' begins; place the'
-          ' register elsewhere, narrow its range, or keep the other away'
+          f' {blocks.describe(i)}, inside {obstacles.names[j]!r} when the'
+          ' episode begins; place the register elsewhere, narrow its range, or'
+          ' keep the other away'
       )
 
 
@@ -249,7 +249,7 @@ def _along_ways(
     physics: Any, root: composer.Entity, shapes: clearance.Shapes
 ) -> clearance.Shapes:
   """Returns shapes, of which moving parts are all along their ways as well."""
-  found = [shapes]
+  all_shapes = [shapes]
   for part in root.iter_entities():
     if isinstance(part, moving.MovingPart) and (travel := part.travel).any():
       elements = part.mjcf_model.find_all('geom')
@@ -258,8 +258,8 @@ def _along_ways(
       shares = np.linspace(0.0, 1.0, int(np.linalg.norm(travel) // _STEP) + 2)
       moved = np.repeat(shares[1:, np.newaxis] * travel, len(movers), axis=0)
       along = shapes.only(np.tile(movers, len(shares) - 1))
-      found.append(along.moved(moved))
-  return clearance.joined(found)
+      all_shapes.append(along.moved(moved))
+  return clearance.joined(all_shapes)
 
 
 def _check_extent(

@@ -163,9 +163,9 @@ class _World:
     needs_ground, corners = self._is_below(blocks).any(), blocks.corners
     if needs_ground:
       low, high = (bound[:, :2] for bound in self._carriers)
-      some = shifts[:, np.newaxis, :2]
-      is_within = corners[0, :2] + some >= low
-      is_within &= corners[-1, :2] + some <= high
+      shifts_in_plane = shifts[:, np.newaxis, :2]
+      is_within = corners[0, :2] + shifts_in_plane >= low
+      is_within &= corners[-1, :2] + shifts_in_plane <= high
       shifts = shifts[is_within.all(axis=-1).any(axis=-1)]
     for shift in shifts:
       if needs_ground and not self._is_carried(corners + shift):

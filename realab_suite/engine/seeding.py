@@ -76,9 +76,9 @@ def random_state(
     seed: int, world: int, episode: int, stream: str
 ) -> np.random.RandomState:
   """Returns a stream as a `RandomState`, for Composer's hooks."""
-  made = np.random.RandomState(0)
-  reseed(made, seed, world, episode, stream)
-  return made
+  generator = np.random.RandomState(0)
+  reseed(generator, seed, world, episode, stream)
+  return generator
 
 
 def reseed(

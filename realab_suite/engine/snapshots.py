@@ -245,10 +245,10 @@ class WorldStates(NamedTuple):
             zip(states, trees.taken(saved, rows), strict=True)
         )
     ]
-    seen = trees.taken(self.observation, rows)
+    arrays = trees.taken(self.observation, rows)
     if observation:
-      seen = merge('observation', observation, indices, seen)
-    return merged, seen
+      arrays = merge('observation', observation, indices, arrays)
+    return merged, arrays
 
 
 def of_batch(tree: Any) -> Any:
