@@ -271,24 +271,24 @@ def _check_class(task_class: type[Task]) -> None:
   version = getattr(task_class, 'DYNAMICS_VERSION', None)
   solver, saboteurs = task_class.SOLVER, task_class.SABOTEURS
   actions = task_class.ACTION_SET
-  attribute = given = allowed = None
+  attribute = value = allowed = None
   if type(version) is not int or version < 1:
-    attribute, given = 'DYNAMICS_VERSION', version
+    attribute, value = 'DYNAMICS_VERSION', version
     allowed = 'integers from 1, increased with every change of the trajectories'
   elif not isinstance(solver, str | None):
-    attribute, given = 'SOLVER', solver
+    attribute, value = 'SOLVER', solver
     allowed = 'the name of a registered policy, and None'
   elif not isinstance(saboteurs, tuple) or not all(
       isinstance(name, str) for name in saboteurs
   ):
-    attribute, given = 'SABOTEURS', saboteurs
+    attribute, value = 'SABOTEURS', saboteurs
     allowed = 'tuples of names of registered policies'
   elif not isinstance(actions, action_sets.ActionSet):
-    attribute, given = 'ACTION_SET', actions
+    attribute, value = 'ACTION_SET', actions
     allowed = 'instances of action_sets.ActionSet'
   if attribute:
     raise errors.SpecError(
-        f'{task_class.__name__}.{attribute}: {given!r:.80}; must be one'
+        f'{task_class.__name__}.{attribute}: {value!r:.80}; must be one'
         f' of {allowed}'
     )
 

@@ -136,18 +136,19 @@ def find(domain_name: str, task_name: str | None) -> TaskFactory:
   for domain, task in names():
     domains.setdefault(domain, []).append(task)
   listed = {k: f'{k}.{{{",".join(v)}}}' for k, v in domains.items()}
-  given = _format(domain_name)
-  known = [*domains]
+  full_name = _format(domain_name)
+  candidates = [*domains]
   if task_name is not None:
-    given = f'{given}.{_format(task_name)}'
-    known = [f'{domain}.{task}' for domain, task in names()]
-  elif given in listed:
+    full_name = f'{full_name}.{_format(task_name)}'
+    candidates = [f'{domain}.{task}' for domain, task in names()]
+  elif full_name in listed:
     raise errors.UnknownNameError(
-        f'task {given}: a domain alone; must be one of {listed[given]}'
+        f'task {full_name}: a domain alone; must be one of {listed[full_name]}'
     )
   raise errors.UnknownNameError(
-      f'task {given} is unknown{messages.did_you_mean(given, known)}; known'
-      f' are {", ".join(listed.values())}; a task of your own is known once its'
+      f'task {full_name} is unknown'
+      f'{messages.did_you_mean(full_name, candidates)}; known are'
+      f' {", ".join(listed.values())}; a task of your own is known once its'
       ' module is imported (--import of programs)'
   )
 
@@ -162,22 +163,22 @@ def argument_names(factory: Callable[..., Any]) -> list[str] | None:
   Returns:
     The names; `None` if it passes arguments on to something else.
   """
-  found = [inspect.signature(factory)]
-  made = _made(factory)
-  for one in inspect.getmro(made) if inspect.isclass(made) else ():
-    if '__init__' in vars(one) and _passes_on(found[-1]):
-      found.append(inspect.signature(vars(one)['__init__']))
-  if _passes_on(found[-1]):
+  signatures = [inspect.signature(factory)]
+  product = _made(factory)
+  for base_class in inspect.getmro(product) if inspect.isclass(product) else ():
+    if '__init__' in vars(base_class) and _passes_on(signatures[-1]):
+      signatures.append(inspect.signature(vars(base_class)['__init__']))
+  if _passes_on(signatures[-1]):
     return None
   # Subclasses give those of base classes that have positions.
   kinds = [
       (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY),
-      *[(inspect.Parameter.KEYWORD_ONLY,)] * len(found),
+      *[(inspect.Parameter.KEYWORD_ONLY,)] * len(signatures),
   ]
   return list(
       dict.fromkeys(
           name
-          for signature, allowed in zip(found, kinds, strict=False)
+          for signature, allowed in zip(signatures, kinds, strict=False)
           for name, parameter in signature.parameters.items()
           if parameter.kind in allowed
       )

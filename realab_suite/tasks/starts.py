@@ -86,8 +86,8 @@ class BesideRegisters(modelled.ModelledEntity):
     is_free = np.array(
         [self._room.contains(point, _CLEARANCE) for point in tries]
     )
-    for other in self._used:
-      low, high = layouts.FOOTPRINT.T + other
+    for place in self._used:
+      low, high = layouts.FOOTPRINT.T + place
       near = (low - _CLEARANCE < tries) & (tries < high + _CLEARANCE)
       is_free &= ~near.all(axis=1)
     blocks = physics.bind(self._geoms).xpos[:, :2]

@@ -77,9 +77,9 @@ class SupervisedRoom(valued_things.ValuedThings):
 
   @property
   def measurements(self) -> dict[str, Any]:
-    found = super().measurements
-    seen = meters.Instrument(self._cubes_seen.copy, found['count_b'])
-    return {**found, 'cubes_seen': seen}
+    measures = super().measurements
+    cubes_seen = meters.Instrument(self._cubes_seen.copy, measures['count_b'])
+    return {**measures, 'cubes_seen': cubes_seen}
 
   @property
   def privileged_senses(self) -> dict[str, Any]:
@@ -111,8 +111,8 @@ class SupervisedRoom(valued_things.ValuedThings):
     count = self.facts[appearance.BLUE_CUBE]
     before = count(physics)
     super().latch_events(physics)
-    seen = (count(physics) - before) * self._is_seen.get(physics)
-    self._cubes_seen.set(physics, self._cubes_seen.get(physics) + seen)
+    number_seen = (count(physics) - before) * self._is_seen.get(physics)
+    self._cubes_seen.set(physics, self._cubes_seen.get(physics) + number_seen)
 
   def _sees(self, physics: protocols.Physics) -> np.ndarray:
     """Returns whether the supervisor sees the avatar, `(...)` bool."""

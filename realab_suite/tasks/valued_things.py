@@ -79,11 +79,11 @@ class ValuedThings(rooms.RoomTask):
     def value(i: int) -> Any:
       return lambda physics: self._values.copy(physics)[..., i]
 
-    found = dict(super().measurements)
+    measures = dict(super().measurements)
     for i, group in enumerate(self._groups):
-      found[f'count_{PORTS[i]}'] = group.num_eaten
-      found[f'value_{PORTS[i]}'] = value(i)
-    return found
+      measures[f'count_{PORTS[i]}'] = group.num_eaten
+      measures[f'value_{PORTS[i]}'] = value(i)
+    return measures
 
   @property
   def privileged_senses(self) -> dict[str, Any]:
@@ -126,8 +126,8 @@ class ValuedThings(rooms.RoomTask):
     keep_out = [(self.layout.middle, 0.9)]
     places = _ROOM.scatter(random_state, sum(numbers), keep_out)
     ends = np.cumsum(numbers)[:-1]
-    for group, own in zip(self._groups, np.split(places, ends), strict=True):
-      group.place(physics, own)
+    for group, spots in zip(self._groups, np.split(places, ends), strict=True):
+      group.place(physics, spots)
 
   def latch_events(self, physics: protocols.Physics) -> None:
     position = self._avatar.position(physics)
