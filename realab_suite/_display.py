@@ -65,13 +65,13 @@ def prepare() -> None:
 def what_to_set(renderer: str | None, error: Exception | str) -> str:
   """Returns advice on an error: the renderer, the cause and alternatives."""
   lines = str(error).strip().splitlines()
-  others = [text for name, text in _RENDERERS.items() if name != renderer]
+  texts = [text for name, text in _RENDERERS.items() if name != renderer]
   named = os.environ.get(_VARIABLE)
   # That of dm_control may have been chosen without the variable.
   setting = f'{_VARIABLE}={named}' if named else f'the renderer {renderer}'
   return (
       f'{setting} ({lines[0] if lines else type(error).__name__}); set'
-      f' {_VARIABLE} to {", ".join(others[:-1])} or {others[-1]} before Python'
+      f' {_VARIABLE} to {", ".join(texts[:-1])} or {texts[-1]} before Python'
       ' starts'
   )
 

@@ -134,17 +134,17 @@ def load_class(domain_name: str) -> TaskClass:
   Raises:
     UnknownNameError: If the domain has no members of either kind.
   """
-  every = [registry.names(tag) for tag in (registry.TRAIN, registry.HELD_OUT)]
+  lists = [registry.names(tag) for tag in (registry.TRAIN, registry.HELD_OUT)]
   train, held_out = (
-      tuple(name for name in names if name[0] == domain_name) for names in every
+      tuple(name for name in names if name[0] == domain_name) for names in lists
   )
   if not (train and held_out):
-    first, second = ({domain for domain, _ in names} for names in every)
-    known = sorted(first & second)
+    first, second = ({domain for domain, _ in names} for names in lists)
+    classes = sorted(first & second)
     raise errors.UnknownNameError(
         f'class of tasks {messages.quote(domain_name)}: the domain has no tasks'
         f' with the tag {registry.HELD_OUT if train else registry.TRAIN!r}'
-        f'{messages.did_you_mean(domain_name, known)}; classes are {known}'
+        f'{messages.did_you_mean(domain_name, classes)}; classes are {classes}'
     )
   return TaskClass(domain_name, train, held_out)
 
@@ -218,11 +218,11 @@ def load(
       'max_steps': MAX_STEPS,
       **_keywords('environment_kwargs', environment_kwargs),
   }
-  known = ('max_steps', 'senses', 'world')
-  if unknown := [key for key in options if key not in known]:
+  keys = ('max_steps', 'senses', 'world')
+  if unknown := [key for key in options if key not in keys]:
     raise errors.SpecError(
         f'environment_kwargs: unknown {messages.quote(unknown)}'
-        f'{messages.did_you_mean(unknown[0], known)}; must be max_steps,'
+        f'{messages.did_you_mean(unknown[0], keys)}; must be max_steps,'
         ' senses or world'
     )
   kwargs = _keywords('task_kwargs', task_kwargs)
@@ -245,14 +245,14 @@ def load(
 
 
 def _problem_of_arguments(
-    error: Exception, factory: Callable[..., Any], given: Mapping[str, Any]
+    error: Exception, factory: Callable[..., Any], keywords: Mapping[str, Any]
 ) -> str:
   """Returns why a factory did not build a task from the given arguments."""
-  hint = "; the seed is 'random'" if 'seed' in given else ''
+  hint = "; the seed is 'random'" if 'seed' in keywords else ''
   declared = registry.argument_names(factory)
   if declared is not None and 'unexpected keyword argument' in str(error):
     names = [*declared, 'random']
-    for key in given:
+    for key in keywords:
       if key not in names:
         return (
             f'unknown argument {messages.quote(key)}'

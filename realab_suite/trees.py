@@ -96,10 +96,10 @@ def differing(tree: Any, other: Any) -> Any:
     pairs = list(zip(tree, other, strict=True))
   else:
     return (_rows_of_bytes(tree) != _rows_of_bytes(other)).any(axis=1)
-  found: Any = False
-  for value, its in pairs:
-    found = found | differing(value, its)
-  return found
+  rows: Any = False
+  for value, counterpart in pairs:
+    rows = rows | differing(value, counterpart)
+  return rows
 
 
 def _rows_of_bytes(array: np.ndarray) -> np.ndarray:
