@@ -43,13 +43,13 @@ def require_same(
       f'{breach}: {sorted(given)} instead of {sorted(expected)}',
   )
   for name, value in expected.items():
-    one, other = np.asarray(given[name]), np.asarray(value)
+    array, wanted = np.asarray(given[name]), np.asarray(value)
     is_same = (
-        one.shape == other.shape
-        and one.dtype == other.dtype
-        and one.tobytes() == other.tobytes()
+        array.shape == wanted.shape
+        and array.dtype == wanted.dtype
+        and array.tobytes() == wanted.tobytes()
     )
     if not is_same:  # To print arrays takes longer than to compare them.
       raise ContractError(
-          f'{breach}: {name!r} is {one!s:.200}; it was {other!s:.200}'
+          f'{breach}: {name!r} is {array!s:.200}; it was {wanted!s:.200}'
       )

@@ -99,7 +99,7 @@ def check_learner(
 def _actions(
     env: batch_environment.BatchEnvironment,
     learner: Any,
-    other: Any,
+    other_learner: Any,
     time_step: Any,
     who: str,
 ) -> np.ndarray:
@@ -108,7 +108,7 @@ def _actions(
   Args:
     env: Environment of the time step.
     learner: The learner.
-    other: Learner that has to act in the same way.
+    other_learner: Learner that has to act in the same way.
     time_step: Time step of the environment.
     who: Description of the other learner, for messages.
   """
@@ -119,7 +119,7 @@ def _actions(
       time_step.observation, before, 'step: the time step was changed'
   )
   contracts.require_same(
-      {'actions': other.step(time_step)},
+      {'actions': other_learner.step(time_step)},
       {'actions': actions},
       f'step: {who} acts otherwise; draw from the seed, and keep everything'
       ' in the state',
@@ -156,9 +156,9 @@ def _check_act(
   """Checks that `act` is a function of its arguments and the networks."""
   before = learner.state()
   key = np.array([3, 4], np.uint32)
-  seen = learner.stack(time_step, None)
+  stack = learner.stack(time_step, None)
   for num_envs in (_NUM_ENVS, 1):
-    observation = {name: value[:num_envs] for name, value in seen.items()}
+    observation = {name: value[:num_envs] for name, value in stack.items()}
     for greedy in (False, True):
       actions = learner.act(observation, key, greedy)
       _check_actions(env, actions, num_envs, 'act')

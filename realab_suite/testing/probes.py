@@ -417,10 +417,10 @@ def _outcome(
   """Returns the outcome of an episode of a learner, in the first world."""
   key = np.array([1, 2], np.uint32)
   time_step = env.reset()
-  seen, taken, readings = None, [], []
+  stack, taken, readings = None, [], []
   while not (time_step.step_type == int(dm_env.StepType.LAST)).all():
-    seen = learner.stack(time_step, seen)
-    actions = learner.act(seen, key, greedy=True)
+    stack = learner.stack(time_step, stack)
+    actions = learner.act(stack, key, greedy=True)
     taken.append(int(np.ravel(actions[0])[-1]))
     time_step = env.step(actions)
     readings.append(
@@ -434,8 +434,8 @@ def _outcome(
   corruption = 0.0
   if near := [register for register in registers if register.role == role]:
     read = near[0].inspect(env.physics)
-    own = read.obstruction + read.permanent + read.temporary
-    corruption = float(own[0])
+    own_corruption = read.obstruction + read.permanent + read.temporary
+    corruption = float(own_corruption[0])
   return Outcome(
       ' '.join(ACTIONS.actions[i][0] for i in taken),
       float(env.task.score(env.physics)[0]),

@@ -96,17 +96,17 @@ def _inputs(
     }
     start = step == 0 or (world == 1 and step == _SECOND_START)
     key = generator.integers(2**63, size=2, dtype=np.uint64)
-    seen = {
+    observation = {
         f'senses/{name}': time_step.observation[f'senses/{name}']
         for name in provider.required_senses
     }
     for name in provider.privileged_senses:
       sensed = env.task.privileged_senses[name](env.physics)
-      seen[f'privileged/{name}'] = np.array(sensed)
+      observation[f'privileged/{name}'] = np.array(sensed)
     for name in (*provider.reads, *provider.writes):
       low_high = ranges.get(name, _RANGE)
-      seen[f'registers/{name}'] = np.array(generator.uniform(*low_high))
-    steps.append((seen, readings, np.array(start), key))
+      observation[f'registers/{name}'] = np.array(generator.uniform(*low_high))
+    steps.append((observation, readings, np.array(start), key))
     time_step = env.step(generator.uniform(spec.minimum, spec.maximum))
   env.close()
   return steps
@@ -211,9 +211,9 @@ def _check_batch(
   for number, inputs in enumerate(batch):
     writes, together = _step(provider, inputs, together, (_NUM_WORLDS,))
     for world, steps in enumerate(worlds):
-      own, alone[world] = _step(provider, steps[number], alone[world], ())
-      for name in {*own} | {*writes}:
-        value, speaks = _parts(own.get(name, (np.zeros(()), False)))
+      expected, alone[world] = _step(provider, steps[number], alone[world], ())
+      for name in {*expected} | {*writes}:
+        value, speaks = _parts(expected.get(name, (np.zeros(()), False)))
         values, speak = _parts(writes.get(name, (np.zeros(3), False)))
         contracts.require(
             np.shape(value) == () and np.shape(values) == (_NUM_WORLDS,),

@@ -175,8 +175,8 @@ def _where(register: registers.Register) -> str:
   return f'{name}, {register.channel} with {type(register.blocks[0]).__name__}'
 
 
-def _are_close(one: Any, other: Any) -> bool:
-  return np.allclose(one, other, rtol=0, atol=_ROUNDING)
+def _are_close(first: Any, second: Any) -> bool:
+  return np.allclose(first, second, rtol=0, atol=_ROUNDING)
 
 
 def _check_values(subject: _Subject) -> None:

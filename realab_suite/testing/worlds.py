@@ -239,8 +239,8 @@ def _check_rewards(
   name = type(task).__name__
   for episode in episodes:
     for moment in episode:
-      for key, one in spec.items():
-        one.validate(moment.arrays[key])
+      for key, array_spec in spec.items():
+        array_spec.validate(moment.arrays[key])
       contracts.require(
           not moment.reward, f'{name}: the agent got {moment.reward!r}'
       )
@@ -249,7 +249,7 @@ def _check_rewards(
           0 <= discount <= 1,
           f'{name}: get_discount returned {discount}; must be from 0 to 1',
       )
-  total = sum(float(one.arrays['true_reward']) for one in episodes[-1])
+  total = sum(float(moment.arrays['true_reward']) for moment in episodes[-1])
   score = float(task.score(env.physics))
   contracts.require(
       np.isclose(total, score),
@@ -287,13 +287,13 @@ def _check_continuations(
   [*_] = moments
   env.reset()
   env.restore(snapshot)
-  found = []
+  later_moments = []
   for action in actions[half:]:
-    found.append(_moment(env, env.step(action), ledger))
-    if found[-1].arrays['step_type'] == dm_env.StepType.LAST:
+    later_moments.append(_moment(env, env.step(action), ledger))
+    if later_moments[-1].arrays['step_type'] == dm_env.StepType.LAST:
       break
   _compare(
-      found,
+      later_moments,
       episodes[0][half + 1 :],
       f'{name}: a restored snapshot continues differently; keep what an'
       ' episode changes in the physics, for example in a state.Slot, and draw'
@@ -319,16 +319,16 @@ def _check_batch(
       figures = _figures(env.task, batch.physics, (_NUM_ENVS,))
       for world, episodes in enumerate(alone):
         if number < len(episodes[0]):
-          found = {
+          arrays = {
               'step_type': np.asarray(int(time_step.step_type[world])),
               'discount': np.asarray(time_step.discount[world]),
           }
           for key, value in {**time_step.observation, **figures}.items():
-            found[key] = value[world]
+            arrays[key] = value[world]
           expected = {**episodes[0][number].arrays}
           del expected['true_reward']
           contracts.require_same(
-              found,
+              arrays,
               expected,
               f'{name}: world {world} of a batch differs from a single world'
               f' in step {number}; index trailing axes and write whole'
@@ -346,14 +346,14 @@ def _check_batch(
 
 
 def _compare(
-    given: list[_Moment], expected: list[_Moment], breach: str
+    moments: list[_Moment], expected: list[_Moment], breach: str
 ) -> None:
   contracts.require(
-      len(given) == len(expected),
-      f'{breach}: {len(given)} steps instead of {len(expected)}',
+      len(moments) == len(expected),
+      f'{breach}: {len(moments)} steps instead of {len(expected)}',
   )
-  for one, other in zip(given, expected, strict=True):
-    contracts.require_same(one.arrays, other.arrays, breach)
+  for moment, expected_moment in zip(moments, expected, strict=True):
+    contracts.require_same(moment.arrays, expected_moment.arrays, breach)
 
 
 def _check_solver(env: environment.Environment) -> np.ndarray:
