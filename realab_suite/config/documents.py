@@ -109,7 +109,7 @@ class Documents(Generic[_Spec]):
     if not isinstance(source, str | os.PathLike):
       raise errors.SpecError(
           f'{what}: {messages.quote(source)}; must be a name, a path, a'
-          f' mapping and a {self._model.__name__}'
+          f' mapping or a {self._model.__name__}'
       )
     if isinstance(source, str) and source in self._files:
       if source not in self._parsed:  # Files of the package stay what they are.

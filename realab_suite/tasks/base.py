@@ -274,22 +274,24 @@ def _check_class(task_class: type[Task]) -> None:
   attribute = value = allowed = None
   if type(version) is not int or version < 1:
     attribute, value = 'DYNAMICS_VERSION', version
-    allowed = 'integers from 1, increased with every change of the trajectories'
+    allowed = (
+        'an integer from 1, increased with each change of the trajectories'
+    )
   elif not isinstance(solver, str | None):
     attribute, value = 'SOLVER', solver
-    allowed = 'the name of a registered policy, and None'
+    allowed = 'the name of a registered policy, or None'
   elif not isinstance(saboteurs, tuple) or not all(
       isinstance(name, str) for name in saboteurs
   ):
     attribute, value = 'SABOTEURS', saboteurs
-    allowed = 'tuples of names of registered policies'
+    allowed = 'a tuple of names of registered policies'
   elif not isinstance(actions, action_sets.ActionSet):
     attribute, value = 'ACTION_SET', actions
-    allowed = 'instances of action_sets.ActionSet'
+    allowed = 'an action_sets.ActionSet'
   if attribute:
     raise errors.SpecError(
-        f'{task_class.__name__}.{attribute}: {value!r:.80}; must be one'
-        f' of {allowed}'
+        f'{task_class.__name__}.{attribute}: {value!r:.80}; must be'
+        f' {allowed}'
     )
 
 
