@@ -9,6 +9,7 @@ import numpy as np
 
 from realab_suite import policies
 from realab_suite import suite
+from realab_suite.config import messages
 from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
 from realab_suite.entities import protocols
@@ -37,7 +38,8 @@ def check_world(
 
   - Its members have the types and shapes that `tasks.base.Task` demands.
   - Its solver earns more than random actions, and neither earns more than
-    `max_true_return`. A second call of `latch_events` pays nothing.
+    `max_true_return`. It is a function that serves whole batches. A second
+    call of `latch_events` pays nothing.
   - Observations match their spec, the reward is always 0.0, and the true
     rewards sum to the score, which is at most `max_true_return`.
   - An episode depends on the seed, its number and the actions, and on nothing
@@ -270,7 +272,7 @@ def _check_continuations(
 ) -> None:
   """Checks that episodes depend on nothing that happened before."""
   name = type(env.task).__name__
-  half = (len(episodes[0]) - 1) // 2
+  numbers = [(len(episodes[0]) - 1) * k // 4 for k in (1, 2, 3)]
   ledger = ledgers.Ledger()
   env.add_sink(ledger)
   env.rewind(1)
@@ -281,24 +283,28 @@ def _check_continuations(
   _compare([*_moments(env, ledger, env.reset(), actions)], episodes[1], breach)
   env.rewind(0)
   moments = _moments(env, ledger, env.reset(), actions)
-  again = [next(moments) for _ in range(half + 1)]
-  _compare(again, episodes[0][: half + 1], breach)
-  snapshot = env.save()
-  [*_] = moments
-  env.reset()
-  env.restore(snapshot)
-  later_moments = []
-  for action in actions[half:]:
-    later_moments.append(_moment(env, env.step(action), ledger))
-    if later_moments[-1].arrays['step_type'] == dm_env.StepType.LAST:
-      break
-  _compare(
-      later_moments,
-      episodes[0][half + 1 :],
-      f'{name}: a restored snapshot continues differently; keep what an'
-      ' episode changes in the physics, for example in a state.Slot, and draw'
-      ' from random_state',
-  )
+  again, snapshots = [], {}
+  for number, moment in enumerate(moments):
+    again.append(moment)
+    if number in numbers:
+      snapshots[number] = env.save()
+  _compare(again, episodes[0], breach)
+  # The first one is restored in the world as the episode left it.
+  for number, snapshot in snapshots.items():
+    env.restore(snapshot)
+    later_moments = []
+    for action in actions[number:]:
+      later_moments.append(_moment(env, env.step(action), ledger))
+      if later_moments[-1].arrays['step_type'] == dm_env.StepType.LAST:
+        break
+    _compare(
+        later_moments,
+        episodes[0][number + 1 :],
+        f'{name}: a restored snapshot continues differently; keep what an'
+        ' episode changes in the physics, for example in a state.Slot, and draw'
+        ' from random_state',
+    )
+    env.reset()
   env.remove_sink(ledger)
 
 
@@ -369,7 +375,10 @@ def _check_solver(env: environment.Environment) -> np.ndarray:
   returns: list[float] = []
   taken: list[list[np.ndarray]] = []
   for name in (task.SOLVER, 'random'):
-    rows = [_play(env, name, k, taken) for k in range(_NUM_EPISODES)]
+    recorders = [_Recorder(policies.make(name)) for _ in range(_NUM_EPISODES)]
+    rows = [_play(env, one, k, taken) for k, one in enumerate(recorders)]
+    if name == task.SOLVER:
+      _check_steps(f'{type(task).__name__}.SOLVER: {name!r}', recorders)
     returns.append(float(np.mean([row.true_return for row in rows])))
     largest = max(row.true_return for row in rows)
     contracts.require(
@@ -385,14 +394,91 @@ def _check_solver(env: environment.Environment) -> np.ndarray:
   return np.array(taken[0])
 
 
+@final
+class _Recorder(policies.Policy):
+  """Policy that acts like another one and keeps its inputs and actions."""
+
+  def __init__(self, policy: policies.Policy) -> None:
+    self.policy = policy
+    self.steps: list[tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]] = []
+    self.chosen: list[int] = []
+
+  @property
+  def action_set(self) -> action_sets.ActionSet:
+    return self.policy.action_set
+
+  @property
+  def required_senses(self) -> tuple[str, ...]:
+    return self.policy.required_senses
+
+  @property
+  def privileged_senses(self) -> tuple[str, ...]:
+    return self.policy.privileged_senses
+
+  def in_action_set(self, action_set: action_sets.ActionSet) -> policies.Policy:
+    self.policy = self.policy.in_action_set(action_set)
+    return self
+
+  def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
+    return self.policy.initial_state(batch_shape)
+
+  def step(
+      self,
+      observation: Mapping[str, np.ndarray],
+      episode_start: np.ndarray,
+      key: np.ndarray,
+      state: Any,
+  ) -> tuple[np.ndarray, Any]:
+    arrays = {name: np.array(value) for name, value in observation.items()}
+    self.steps.append((arrays, np.array(episode_start), np.array(key)))
+    chosen, state = self.policy.step(observation, episode_start, key, state)
+    self.chosen.append(int(chosen))
+    return chosen, state
+
+
+def _check_steps(where: str, recorders: list[_Recorder]) -> None:
+  """Checks that a policy is a function that serves a batch of episodes."""
+  policy = recorders[0].policy
+  state = policy.initial_state((len(recorders),))
+  for number in range(max(len(one.steps) for one in recorders)):
+    # An episode that is over repeats its last step.
+    lasts = [min(number, len(one.steps) - 1) for one in recorders]
+    observations, starts, keys = zip(
+        *(one.steps[k] for one, k in zip(recorders, lasts, strict=True)),
+        strict=True,
+    )
+    batch = {
+        name: np.stack([one[name] for one in observations])
+        for name in observations[0]
+    }
+    expected = [one.chosen[k] for one, k in zip(recorders, lasts, strict=True)]
+    is_over = [k < number for k in lasts]
+    inputs = batch, np.stack(starts), np.stack(keys), state
+    for _ in range(2):
+      try:
+        chosen, state = policy.step(*inputs)
+      except Exception as error:  # Policies may raise any class.
+        raise contracts.ContractError(
+            f'{where}: {messages.exception(error)}: in a batch, numbers are'
+            ' arrays with an axis of worlds; use np.where instead of if'
+        ) from error
+      contracts.require(
+          np.shape(chosen) == (len(recorders),)
+          and np.all(is_over | (chosen == np.array(expected))),
+          f'{where}: chose {chosen} in a batch in step {number}, and {expected}'
+          ' in these worlds alone; index trailing axes, and keep what it'
+          ' remembers in the state',
+      )
+
+
 def _play(
     env: environment.Environment,
-    policy: str,
+    policy: policies.Policy,
     episode: int,
     taken: list[list[np.ndarray]],
 ) -> results.EpisodeResult:
   """Plays an episode with a policy, and adds the list of its actions."""
-  actor = actors.make(policies.make(policy), env)
+  actor = actors.make(policy, env)
   actor.begin(episode)
   actions: list[np.ndarray] = []
   taken.append(actions)
@@ -417,5 +503,5 @@ def _latch_again(env: environment.Environment) -> None:
       after == before,
       f'{type(env.task).__name__}: a second call of latch_events changes the'
       f' score from {before} to {after}; remember in a state.Slot what was'
-      ' paid',
+      ' paid, and call super().after_step in after_step, which calls it',
   )

@@ -95,6 +95,21 @@ def _pays_again(self: Any, physics: Any) -> None:
   self.earn(physics, 0.01 * np.ones_like(self.score(physics)))
 
 
+def _resets(self: Any, physics: Any, random_state: Any) -> None:
+  self.place_avatar(physics, random_state)
+  self.count = 0
+
+
+def _latches_once(self: Any, physics: Any) -> None:
+  self.count = max(self.count, int(np.max(self.score(physics)) >= 16))
+
+
+def _pays_latched(self: Any, physics: Any, random_state: Any) -> None:
+  self.latch_events(physics)
+  reward = np.full_like(self.score(physics), 1.0 + self.count)
+  self.earn(physics, reward)
+
+
 def _sum_of_positions(self: Any) -> Any:
   return {'place': lambda physics: np.sum(self.avatar.position(physics))}
 
@@ -114,6 +129,13 @@ _BREACHES: dict[str, tuple[dict[str, Any], str]] = {
         'a second call of latch_events changes the score',
     ),
     'state in Python': ({'after_step': _remembers}, 'depends on earlier ones'),
+    'a late event in Python': (
+        {
+            'initialize_episode': _resets, 'latch_events': _latches_once,
+            'after_step': _pays_latched,
+        },
+        'a restored snapshot continues differently',
+    ),
     'a start in Python': (
         {'initialize_episode': _starts_later}, 'depends on earlier ones',
     ),
@@ -172,6 +194,66 @@ def test_a_breach_that_only_the_solver_reaches_is_named():
     testing.check_world(Gourmet, max_steps=60)
   Gourmet.SOLVER = None
   testing.check_world(Gourmet, max_steps=60, num_steps=20)
+
+
+class _Walker(policies.Policy):
+  """Earns more than random actions in `_Walk`."""
+
+  required_senses = ('time_left',)
+
+  def __init__(self) -> None:
+    self.count = 0
+
+  def step(self, observation: Any, episode_start: Any, key: Any, state: Any):
+    forward = self.action_set.index('forward')
+    return np.where(episode_start, forward, forward), state
+
+
+class _Branching(_Walker):
+
+  def step(self, observation: Any, episode_start: Any, key: Any, state: Any):
+    if observation['senses/time_left'] > 0.5:
+      return super().step(observation, episode_start, key, state)
+    return self.action_set.index('forward'), state
+
+
+class _Counting(_Walker):
+
+  def step(self, observation: Any, episode_start: Any, key: Any, state: Any):
+    self.count += 1
+    name = 'forward' if self.count % 5 else 'wait'
+    return np.where(episode_start, 0, 0) + self.action_set.index(name), state
+
+
+class _Walk(_Plain):
+  """Gives a true reward for the distance from the start."""
+
+  SOLVER = 'test_walker'
+
+  def after_step(self, physics: Any, random_state: Any) -> None:
+    square = (self.avatar.position(physics) ** 2).sum(axis=-1)
+    self.earn(physics, square / (1 + square))
+
+
+@pytest.mark.parametrize(
+    ('solver', 'problem'),
+    [
+        (_Walker, None),
+        (_Branching, 'use np.where instead of if'),
+        (_Counting, 'in these worlds alone'),
+    ],
+)
+def test_a_solver_is_a_function_that_serves_batches(
+    solver: Any, problem: str | None
+):
+  with registries.preserved():
+    policies.POLICIES.add('test_walker')(solver)
+    if problem is None:
+      testing.check_world(_Walk, max_steps=20)
+      return
+    with pytest.raises(testing.ContractError, match=problem) as raised:
+      testing.check_world(_Walk, max_steps=20)
+  assert str(raised.value).startswith("_Walk.SOLVER: 'test_walker'")
 
 
 # The rest of the package.
