@@ -16,10 +16,14 @@ from realab_suite.feedback.providers import base
 from realab_suite.testing import contracts
 
 _NUM_WORLDS = 3
-_NUM_STEPS = 6
+_NUM_STEPS = 8
 # World 1 begins another episode in this step.
 _SECOND_START = 3
 _RANGE = (-2.0, 16.0)
+# Readings of these steps are 0 in every register whose range has it.
+_ZEROS = 1, 2, 7
+# Readings of these steps are those of the step before.
+_REPEATED = 4, 6
 
 # Arguments of `step`, without the state.
 _Inputs = tuple[Any, Any, Any, Any]
@@ -35,7 +39,8 @@ def check_provider(
   """Checks that a provider keeps the contract of providers.
 
   - Equal inputs give equal outputs. Inputs and earlier outputs stay unchanged.
-  - It writes finite numbers, and only to the registers that it declares.
+  - It writes finite numbers, and only to the registers that it declares, also
+    where a reading is 0 or stands still.
   - Each world of a batch gets what it would get alone.
   - An episode does not depend on the one before.
 
@@ -91,9 +96,11 @@ def _inputs(
   steps = []
   for step in range(_NUM_STEPS):
     readings = {
-        name: np.array(generator.uniform(*ranges.get(name, _RANGE)))
+        name: np.array(_number(generator, ranges.get(name, _RANGE), step))
         for name in provider.reads
     }
+    if step in _REPEATED:
+      readings = {name: np.array(one) for name, one in steps[-1][1].items()}
     start = step == 0 or (world == 1 and step == _SECOND_START)
     key = generator.integers(2**63, size=2, dtype=np.uint64)
     observation = {
@@ -104,12 +111,20 @@ def _inputs(
       sensed = env.task.privileged_senses[name](env.physics)
       observation[f'privileged/{name}'] = np.array(sensed)
     for name in (*provider.reads, *provider.writes):
-      low_high = ranges.get(name, _RANGE)
-      observation[f'registers/{name}'] = np.array(generator.uniform(*low_high))
+      number = _number(generator, ranges.get(name, _RANGE), step)
+      observation[f'registers/{name}'] = np.array(number)
     steps.append((observation, readings, np.array(start), key))
     time_step = env.step(generator.uniform(spec.minimum, spec.maximum))
   env.close()
   return steps
+
+
+def _number(
+    generator: np.random.Generator, low_high: tuple[float, float], step: int
+) -> float:
+  """Returns a random number, or what is closest to 0 in some steps."""
+  number = generator.uniform(*low_high)
+  return float(np.clip(0.0, *low_high)) if step in _ZEROS else number
 
 
 def _together(of_worlds: Sequence[_Inputs]) -> _Inputs:
@@ -222,13 +237,13 @@ def _check_batch(
         )
         spoken = bool(np.broadcast_to(speak, _NUM_WORLDS)[world])
         contracts.require(
+            not spoken or np.isfinite(np.asarray(value, float)),
+            f'{where}: wrote {value} to {name!r}; values have to be finite',
+        )
+        contracts.require(
             spoken == bool(speaks) and (not spoken or values[world] == value),
             f'{where}: wrote {values[world]} to {name!r} in a batch, and'
             f' {value} in that world alone',
-        )
-        contracts.require(
-            not spoken or np.isfinite(np.asarray(value, float)),
-            f'{where}: wrote {value} to {name!r}; values have to be finite',
         )
 
 

@@ -187,7 +187,25 @@ def _divide(self: Any, step: Any, *inputs: Any) -> Any:
   return {'reward': writes['reward'] * np.inf}, state
 
 
+def _divide_by_change(self: Any, step: Any, *inputs: Any) -> Any:
+  start, previous = inputs[2], inputs[-1]['sum']
+  change = inputs[1]['score'] - np.where(start, -3.0, previous)
+  with np.errstate(invalid='ignore', divide='ignore'):
+    return {'reward': change / change}, {'sum': inputs[1]['score'] + 0.0}
+
+
+def _divide_by_reading(self: Any, step: Any, *inputs: Any) -> Any:
+  score = inputs[1]['score']
+  with np.errstate(invalid='ignore'):
+    return {'reward': score / score}, {'sum': score + 0.0}
+
+
 _BREACHES = {
+    'a reading that stands still': (
+        _divide_by_change,
+        'values have to be finite',
+    ),
+    'a reading of 0': (_divide_by_reading, 'values have to be finite'),
     'chance': (_draw, 'equal arguments gave other results'),
     'changed readings': (_scribble, 'step changed its arguments'),
     'a state in place': (_reuse, 'step changed its arguments'),
