@@ -64,7 +64,7 @@ class Registry(Generic[T]):
       hint = messages.did_you_mean(name, [*self])
       raise errors.UnknownNameError(
           f'{self._what} {messages.quote(name)} is unknown{hint}; known are'
-          f' {sorted(self)}'
+          f' {sorted(self)}, and those of modules that --import names'
       )
     return self._entries[name]
 

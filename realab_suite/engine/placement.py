@@ -279,7 +279,8 @@ def _check_extent(
   for i, corner in np.argwhere(is_outside.any(axis=-1)).tolist():
     raise errors.SpecError(
         f'register {name!r} {blocks.describe(i, corners[i, corner])}, outside'
-        f' the arena {_format(extent.low, extent.high)}'
+        f' the arena {_format(extent.low, extent.high)};'
+        f' change its place, or narrow its range (registers.{name}.range)'
     )
 
 

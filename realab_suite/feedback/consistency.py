@@ -146,8 +146,7 @@ def _refuse_unwritten(design: Any) -> None:
         raise ValueError(
             f'providers[{i}].reads: no meter writes the register {name!r};'
             ' add an entry of meters that does, such as {measures:'
-            f' score, writes: {name}}}, and a stated initial, which the'
-            ' register keeps'
+            f' score, writes: {name}}}, or state `initial`'
         )
   for register, names in design.ports_by_register.items():
     spec = design.registers[register]
@@ -159,8 +158,8 @@ def _refuse_unwritten(design: Any) -> None:
       raise ValueError(
           f'registers.{register}: no provider writes this {spec.role} register;'
           ' add an entry of providers that does, such as {kind:'
-          f' difference, reads: [score], writes: [{names[0]}]}}, and a stated'
-          ' initial, which the register keeps'
+          f' difference, reads: [score], writes: [{names[0]}]}}, or state'
+          ' `initial`'
       )
 
 

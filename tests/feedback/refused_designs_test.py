@@ -112,7 +112,8 @@ _DOES_NOT_FIT = {
         " world; did you mean 'score'?; must be one of ['score']",
     'registers.reward.place=[0, 0] & registers.reward.range=[0, 200]':
         "register 'reward' at value 40.625 would be at (4.06, 0.25), outside"
-        ' the arena (-4, -4) to (4, 4)',
+        ' the arena (-4, -4) to (4, 4); change its place, or narrow its range'
+        ' (registers.reward.range)',
     'registers.reward.place=[9, 0]':
         "register 'reward' at value -2 would be at (9, 0), outside the"
         ' arena',
