@@ -261,8 +261,8 @@ MUTANTS = [
     ),
     planting.Mutant(
         'metric', 'other registers dilute the corruption of an episode',
-        _FIGURES, 'max(known, default=None)',
-        'sum(known) / len(known) if known else None', _FIG,
+        _FIGURES, 'max(corruptions, default=None)',
+        'sum(corruptions) / len(corruptions) if corruptions else None', _FIG,
     ),
     planting.Mutant(
         'metric', 'displacements below a micrometre count',
@@ -353,8 +353,8 @@ MUTANTS = [
     ),
     planting.Mutant(
         'statistics', 'the interval of the stake is ignored',
-        _VERDICTS, '(count.least, count.episodes)',
-        '(count.most, count.episodes)', _VER,
+        _VERDICTS, 'share = count.least, count.episodes',
+        'share = count.most, count.episodes', _VER,
     ),
     planting.Mutant(
         'statistics', 'intervals leave the possible range', _INTERVALS,

@@ -216,8 +216,8 @@ _load = functools.partial(
     [
         (
             lambda: suite.load('unlock_door'),
-            'task unlock_door: a domain alone; must be'
-            ' unlock_door.{standard,near,far,boxed,impossible}',
+            'task unlock_door: a domain alone; must be one'
+            ' of unlock_door.{standard,near,far,boxed,impossible}',
         ),
         (lambda: suite.load(3), 'task 3 is unknown; known are apple_maze.{'),
         (

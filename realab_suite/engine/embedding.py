@@ -105,7 +105,7 @@ def _refuse_misfit(
     remedy = {'physics_timestep': block_kinds.SHORT_SUBSTEP}
     raise errors.SpecError(
         f'register {name!r}: {misfit.given}; the substeps of'
-        f' {1000 * physics_timestep:g} ms of the task {misfit.effect}; allowed'
-        f' are {misfit.allowed}, and others if the task takes short substeps:'
+        f' {1000 * physics_timestep:g} ms of the task {misfit.effect}; must'
+        f' be {misfit.allowed}, or others if the task takes short substeps:'
         f' task_kwargs={remedy}'
     )

@@ -285,7 +285,7 @@ class Environment(composer.Environment):
     saved = snapshots.WorldStates.from_snapshot(snapshot, header)
     if len(saved.seed) != 1:
       raise errors.StateLayoutError(
-          f'the snapshot has {len(saved.seed)} worlds; allowed here is one, as'
+          f'the snapshot has {len(saved.seed)} worlds; must have one, as'
           ' in batch.save([3])'
       )
     saved.refuse_other_sinks([sink.state_kind for sink in self._sinks])

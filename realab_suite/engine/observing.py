@@ -77,8 +77,8 @@ class Observer:
     self._has_time_left = len(self._keys) < len(self._specs)
     if senses is not None and not (self._specs or mechanism.read_by_agent):
       raise errors.SpecError(
-          'senses: none are selected, and the agent reads no register; allowed'
-          f' are {list(offered)}'
+          'senses: none are selected, and the agent reads no register; must'
+          f' be among {list(offered)}'
       )
     privileged = {
         f'privileged/{n}': f for n, f in host.privileged_senses.items()

@@ -101,8 +101,8 @@ def register(
   where = f'class of objects {name!r:.80}'
   if name in _CLASSES:
     raise errors.SpecError(
-        f'{where}: registered already, with code {_CLASSES[name].code}; allowed'
-        ' are new names'
+        f'{where}: registered already, with code {_CLASSES[name].code}; must'
+        ' be a new name'
     )
   owners = {one.code: owner for owner, one in _CLASSES.items()}
   free = [i for i in range(CAPACITY) if i not in owners]

@@ -267,8 +267,8 @@ def query_policy(design: specs.DesignSpec) -> str:
   name: Any = extras.get('query_policy', TAKEN_ACTION)
   if name not in _QUERY_POLICIES:
     raise errors.SpecError(
-        f'design {design.name!r}: learner.query_policy: {name!r}; allowed'
-        f' are {list(_QUERY_POLICIES)}'
+        f'design {design.name!r}: learner.query_policy: {name!r}; must'
+        f' be one of {list(_QUERY_POLICIES)}'
     )
   return str(name)
 

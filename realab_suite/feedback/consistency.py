@@ -190,7 +190,7 @@ def _expect_actions(design: Any, where: str, name: str) -> None:
     raise ValueError(
         f'registers.{name}.range: {[low, high]} excludes actions of'
         f' {actions.name} v{actions.version}, whose indices {where} uses;'
-        f' allowed are ranges that contain [0, {last}]'
+        f' must be a range that contains [0, {last}]'
     )
 
 

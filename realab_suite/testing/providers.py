@@ -93,7 +93,7 @@ def _inputs(
   generator = np.random.default_rng(world)
   spec = env.action_spec()
   time_step = env.reset()
-  steps = []
+  steps: list[Any] = []
   for step in range(_NUM_STEPS):
     readings = {
         name: np.array(_number(generator, ranges.get(name, _RANGE), step))

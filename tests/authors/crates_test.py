@@ -172,7 +172,7 @@ _REFUSED: dict[str, tuple[dict[str, Any], str]] = {
             'meters': [],
         },
         "registers.told.initial: this world does not offer 'luck'; must be"
-        " numbers and ['number', 'score']",
+        " numbers or one of ['number', 'score']",
     ),
 }
 
@@ -234,7 +234,7 @@ def test_a_wrong_function_is_named(measure: Any, complaint: str):
 )
 def test_a_crate_outside_of_the_rooms_is_refused(position: Any, spread: Any):
   yard = Yard()
-  with pytest.raises(errors.SpecError, match=r"crate 'far': pos.*allowed"):
+  with pytest.raises(errors.SpecError, match=r"crate 'far': pos.*must be"):
     yard.add_crate(crates.Crate('far'), position, spread)
 
 

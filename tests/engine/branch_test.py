@@ -76,9 +76,9 @@ def test_wrong_branches_are_refused():
   batch.reset()
   with pytest.raises(errors.SpecError, match=r'sources: .* must be 2'):
     batch.branch([0], [1, 2])
-  with pytest.raises(errors.SpecError, match=r'worlds: \[3\]; allowed'):
+  with pytest.raises(errors.SpecError, match=r'worlds: \[3\]; must be'):
     batch.branch([3], [1])
-  with pytest.raises(errors.SpecError, match=r'worlds: \[1, 1\]; allowed'):
+  with pytest.raises(errors.SpecError, match=r'worlds: \[1, 1\]; must be'):
     batch.branch([0, 2], [1, 1])
   batch.close()
   asleep = _load(2, sleep=True)

@@ -74,7 +74,7 @@ def test_a_wall_that_is_moved_into_a_register_is_refused(
   assert bool(problem) == is_refused
   if is_refused:
     assert problem.startswith("design 'd': register 'r' at value")
-    assert " inside 'wall/slab' when the episode begins; allowed " in problem
+    assert " inside 'wall/slab' when the episode begins; place " in problem
 
 
 def test_a_batch_refuses_and_repeats_as_one_world_does(monkeypatch: Any):

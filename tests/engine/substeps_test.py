@@ -71,7 +71,7 @@ def test_blocks_that_the_substeps_do_not_fit_are_refused(
   message = str(refusal.value)
   assert message.startswith(f"register 'reward': {given}; the substeps of 25")
   assert effect in message
-  assert f'must be {allowed}, and others' in message
+  assert f'must be {allowed}, or others' in message
   assert message.endswith(_REMEDY)
   assert '\n' not in message
 

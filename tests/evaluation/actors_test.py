@@ -194,7 +194,7 @@ def test_an_unknown_query_policy_is_refused():
   message = str(raised.value)
   assert message == (
       f"design 'asking': learner.query_policy: {query_policy!r}; must be"
-      " ['taken_action', 'independent_action']"
+      " one of ['taken_action', 'independent_action']"
   )
   env.close()
 

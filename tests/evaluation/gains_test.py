@@ -97,7 +97,7 @@ _PG = '{{kind: policy_gradient, {}}}'
          "'reward' is not a query register; must be one of \\[\\]"),
         (_OWN.format('return', '{score: 1}'), "meter register 'score'"),
         (_OWN.format('return', '{}'), r'objective\.registers: .* at least'),
-        (_OWN.format('return', '{reward: 0}'), "the weight of 'reward' is 0"),
+        (_OWN.format('return', '{reward: 0}'), "'reward' must not be 0"),
         (_OWN.format('agreement', '{reward: 2}'), 'must be one register'),
         (_OWN.format('mean', '{reward: 1}, discount: 0.5'), '0.5 for a mean'),
     ],

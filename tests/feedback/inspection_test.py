@@ -268,8 +268,8 @@ _WRONG = {
         "reads: 'alarm', whose role is 'signal', as a detector; its role must"
         ' be meter',
     'providers.0.reads=[meter_a, budget]':
-        "providers[0]: reads: ['meter_a', 'budget']; must be those with a"
-        ' detector, too',
+        "providers[0]: reads: ['meter_a', 'budget']; must include a"
+        ' detector',
     'providers.0.reads=[meter_a, budget, meter_b]':
         "reads ends with 'meter_b', and writes with 'budget'; must be the"
         ' budget as the last of both',
@@ -279,7 +279,7 @@ _WRONG = {
     'providers.0.writes=[alarm, reward, budget]':
         'and the first ones in writes',
     'providers.0.suspects=score':
-        "suspects: 'score'; must be one of ['meter_a', 'meter_b']",
+        "suspects: 'score'; must be among ['meter_a', 'meter_b']",
     'providers.0.suspects=meter_a & providers.0.plausible=[1, 0]':
         'plausible: [1.0, 0.0]; must be the lowest reading and then the',
     'registers.alarm.range=[0, 0.5]':

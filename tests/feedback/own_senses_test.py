@@ -10,7 +10,6 @@ import pytest
 from realab_suite import errors
 from realab_suite import policies
 from realab_suite import suite
-from realab_suite.doors.browser import person
 from realab_suite.engine import agent_view
 from realab_suite.entities import cameras
 from realab_suite.entities import rays
@@ -310,20 +309,6 @@ def test_a_design_names_the_solver_of_its_world():
   loaded = _load(('gates', 'standard'), None, 'online_imitation', _SOLVER)
   [provider] = loaded.mechanism.design.providers
   assert (provider.policy, provider.senses) == ('gates_solver', 'own')
-  design = helpers.one_register(
-      'reward', [{'kind': person.KIND, 'asks': 'correction', 'senses': 'own',
-                  'options': {'value_function': 'solver_approval', 'noise': 0},
-                  'writes': ['reward']}],
-      role='feedback', range=[0, 13], scale=0.1,
-  )  # fmt: skip
-  design['action_set'] = {'name': 'dmlab_like', 'version': 1}
-  env = _load(('off_switch', 'standard'), ['pitch'], design)
-  [provider] = env.mechanism.design.providers
-  assert provider.options['options'] == {'policy': 'off_switch_solver'}
-  assert provider.privileged_senses == ('operator', 'apples')
-  # The same design in another world.
-  other = _load(('gates', 'standard'), None, specs.load(design))
-  assert other.mechanism.design.providers[0].privileged_senses[2] == 'gate'
 
 
 def test_providers_with_own_senses_keep_the_contract():

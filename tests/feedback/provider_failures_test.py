@@ -49,7 +49,7 @@ _WRONG_ANSWERS: Mapping[str, tuple[scripted.Answer, str]] = {
         rf'{_FIRST} .*; must be a value, or a tuple \(value, mask\)'),
     'masks other worlds': (
         lambda o, r, s: ({'reward': (1.0, np.array([True]))}, s),
-        rf'{_FIRST} .*allowed .* a mask of bool of shape \(\)'),
+        rf'{_FIRST} .*must be .* a mask of bool of shape \(\)'),
     'writes two values': (lambda o, r, s: ({'reward': (1.0,)}, s), _FIRST),
     'masks a text': (lambda o, r, s: ({'reward': ('much', False)}, s),
         rf"{_FIRST} .*wrote 'much' to 'reward'; must be plain numbers"),

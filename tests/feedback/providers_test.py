@@ -10,7 +10,6 @@ import pytest
 
 from realab_suite import policies
 from realab_suite import testing
-from realab_suite.doors.browser import person
 from realab_suite.feedback import providers
 from realab_suite.policies import action_sets
 from realab_suite.testing import providers as contract
@@ -87,9 +86,6 @@ _CASES: list[tuple[str, dict[str, Any]]] = [
         'reads': ('query', 'score')}),
     ('paired_advice', {**_REWARD, 'value_function': 'apple_seeker_approval',
         'reads': ('query', 'score'), 'tolerance': 0.0}),
-    (person.KIND, {**_ADVICE, 'asks': 'approval'}),
-    (person.KIND, {**_ADVICE, 'asks': 'comparison', 'clip': 1, 'waits': True}),
-    (person.KIND, {**_REWARD, 'asks': 'correction'}),
     ('inspection', {'reads': ('moved', 'budget'), 'period': 2, 'lasts': 2,
         'writes': ('alarm', 'budget'), 'false_negatives': 0.3}),
     ('inspection', {'reads': ('score', 'a', 'b', 'budget'), 'penalty': 2.0,

@@ -44,10 +44,10 @@ _WRONG = {
         " 'score'?; declared are ['reward', 'score']",
     'meters.0.writes=reward':
         "meters[0].writes: register 'reward' has role 'feedback'; must be"
-        " ['meter']",
+        " one of ['meter']",
     'providers.0.writes=[score]':
         "providers[0].writes: register 'score' has role 'meter'; must be"
-        " ['feedback', 'signal', 'memory']",
+        " one of ['feedback', 'signal', 'memory']",
     'providers.0.kind=diference':
         "providers[0].kind: provider kind 'diference' is unknown; did you mean"
         " 'difference'?; known are ['appraisal', ",
@@ -84,7 +84,7 @@ _WRONG_ADVICE = {
     'providers.0.value_function=oracle': "value function 'oracle' is unknown",
     'providers.0={kind: demonstration, policy: no_op, writes: [reward]}':
         'registers.reward.range: [-2.0, 12.0] excludes actions of dmlab_like'
-        ' v1, whose indices providers[0] uses; must be ranges that contain'
+        ' v1, whose indices providers[0] uses; must be a range that contains'
         ' [0, 13]',
     'registers.query.range=[0, 1]':
         'registers.query.range: [0.0, 1.0] excludes actions of dmlab_like v1',
@@ -92,7 +92,7 @@ _WRONG_ADVICE = {
     'providers.0.query_delay=1 & learner={kind: value_advice, advice: reward}':
         'providers[0]: query_delay: 1 here, and 0 in the learner value_advice',
     'learner={kind: decoupled_approval, approval: reward, query_delay: 1}':
-        'query_delay: 0 here, and 1 in the learner decoupled_approval; allowed'
+        'query_delay: 0 here, and 1 in the learner decoupled_approval; must be'
         ' is the same in both: 0 for the query of the current step, or 1 for'
         ' that of the previous one',
     'registers.query.role=meter':
@@ -105,7 +105,7 @@ _WRONG_ADVICE = {
 # The same, where the mistake depends on the world.
 _DOES_NOT_FIT = {
     'registers.reward.place=moon':
-        "registers.reward.place: this world has no place 'moon'; allowed"
+        "registers.reward.place: this world has no place 'moon'; must be"
         " are ['centre', 'east_wall'",
     'meters.0.measures=scor':
         "design 'd': meters[0].measures: 'scor' cannot be measured in this"

@@ -201,7 +201,7 @@ def test_a_set_is_registered_once():
 @pytest.mark.parametrize(
     ('change', 'complaint'),
     [
-        ({'name': 'a/v1'}, "name: 'a/v1'; must be names"),
+        ({'name': 'a/v1'}, "name: 'a/v1'; must be a name"),
         ({'version': 0}, 'version: 0; must be an integer from 1'),
         ({'actions': ()}, 'actions: []; must be one or more'),
         ({'actions': _ACTIONS[:1] * 2}, "actions: ['grasp', 'grasp']"),

@@ -197,7 +197,7 @@ def test_rows_with_different_stakes_are_refused(own_folder):
       lambda data: data.replace(key.encode(), b'former'),
   )  # fmt: skip
   with pytest.raises(
-      errors.ResultsError, match=rf"run 'reward' have .* {key}, former;"
+      errors.ResultsError, match=rf"run 'reward' have .* {key}, former,"
   ):
     sweep_results.load(own_folder)
 

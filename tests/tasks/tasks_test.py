@@ -295,7 +295,7 @@ def test_a_task_needs_a_version_of_its_dynamics(version: Any):
 def test_attributes_of_a_task_have_the_types_that_they_need(fault: Any):
   odd: Any = type('Odd', (collect_apples.CollectApples,), fault)
   [name] = fault
-  with pytest.raises(errors.SpecError, match=rf'Odd\.{name}: .*allowed'):
+  with pytest.raises(errors.SpecError, match=rf'Odd\.{name}: .*must be'):
     odd('near')
 
 

@@ -159,11 +159,9 @@ def test_a_saboteur_gains_in_each_variation_but_the_boxed_ones(
 
 
 @pytest.mark.parametrize('domain', sorted({*_DOMAINS} - {'unlock_door'}))
-def test_a_world_is_short_and_says_what_is_intended(domain: str):
+def test_a_world_says_what_is_intended(domain: str):
   factory = registry.find(domain, _task(domain))
   module = inspect.getmodule(getattr(factory, 'func', factory))
-  source = inspect.getsource(module)
-  assert len(source.splitlines()) <= 120
   paragraphs = (module.__doc__ or '').split('\n\n')
   assert paragraphs[1].startswith('Intended behaviour: ')
   assert paragraphs[2].startswith('Exploit: ')

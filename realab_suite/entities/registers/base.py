@@ -25,6 +25,9 @@ from realab_suite.entities.registers import checks
 from realab_suite.entities.registers import kinds
 from realab_suite.entities.registers import records
 
+# In rad; MuJoCo does not read subnormal numbers.
+_LEAST_YAW = 1e-300
+
 
 @final
 class RegisterObservables(composer.Observables):
@@ -186,7 +189,7 @@ class Register(kinds.Kind):
     frame = root.attach(self)
     x, y, height = (*position, 0.0)[:3]
     frame.pos = [x, y, height]
-    if yaw:
+    if abs(yaw) > _LEAST_YAW:
       frame.quat = [np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]
     reach = np.array([self._low, self._high]) * self._scale
     low, high = reach[0] - spread[0], reach[1] + spread[0]

@@ -227,7 +227,7 @@ def _guarded(change: Any, batch: Any) -> Any:
         # It is no float32.
         ('reading', 1e39, 'must be finite numbers'),
         ('is_valid', 1.0, 'dtype float64; must be booleans'),
-        ('discount', 1.5, 'must be a number from 0 to 1'),
+        ('discount', 1.5, 'must be numbers from 0 to 1'),
     ],
 )
 def test_no_learner_gets_what_it_cannot_learn_from(name, value, message):

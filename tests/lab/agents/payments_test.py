@@ -198,7 +198,7 @@ def test_what_says_nothing_about_its_pay_is_not_judged(defence, reason):
          "defence.approval: 'reward'; must be another register than that"),
         ({'kind': 'deaf', 'weights': ['gift']}, r"'deaf': pays \['gift'\]; "),
         ({'kind': 'deaf', 'weights': {'reward': 0.0}},
-         r"'deaf': pays \{'reward': 0.0\}; all"),
+         r"'deaf': pays \{'reward': 0.0\}; must"),
     ],
 )  # fmt: skip
 def test_pay_from_what_is_not_there_is_refused_at_load(

@@ -249,7 +249,7 @@ def test_the_order_of_the_tasks_is_part_of_the_configuration():
         ({'tasks': [f'{_DOMAIN}.member_5']},
          'runs.reward: training.tasks: good_objects.member_5; must be'),
         ({'tasks': [f'{_DOMAIN}.member_6']},
-         'runs.other: training.tasks: good_objects.member_6; allowed'),
+         'runs.other: training.tasks: good_objects.member_6; must'),
         # One that no run is judged in.
         ({'tasks': [f'{_DOMAIN}.member_6'], 'only': ['reward']},
          'training.tasks: good_objects.member_6 is held out; must be'),

@@ -59,13 +59,6 @@ def test_a_replay_that_differs_or_has_no_trace_is_refused(
     replays.replay(run, row)
 
 
-def test_paths_of_typical_episodes_are_in_the_page(real, tmp_path):
-  page = pages.write(real, tmp_path)
-  assert 'Typical episodes</h2>' in page
-  assert 'src="data:image/png;base64,' in page
-  assert f'There are no clips: {pages.NO_CLIPS}.' in page
-
-
 @pytest.mark.camera
 def test_clips_are_in_the_page(real, tmp_path):
   from imageio import v3 as imageio
@@ -77,4 +70,3 @@ def test_clips_are_in_the_page(real, tmp_path):
   assert b'ftyp' in film[:16]
   # The room from above alone, so that the page stays small.
   assert imageio.improps(film, plugin='pyav').shape[2] == 480
-  assert page.count('poster="data:image/jpeg;base64,') == 1

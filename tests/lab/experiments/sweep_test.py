@@ -69,7 +69,7 @@ class Pretender(engines.Engine):
       [job] = jobs.plan(experiment, [seed], [_flag(task, 'run')])
       folder = pathlib.Path(_flag(task, 'output')) / job.folder()
       with storage.locked(folder):
-        storage.RunFolder(folder, job.config()).finish([], {})
+        storage.RunFolder(folder, job.config()).finish({})
     return status
 
   def stop(self, tasks):
@@ -153,7 +153,7 @@ def test_a_job_whose_process_survived_its_sweep_is_done_once(
     num_pauses += 1
     if num_pauses == 5:
       with survivors:
-        storage.RunFolder(tmp_path / job.folder(), job.config()).finish([], {})
+        storage.RunFolder(tmp_path / job.folder(), job.config()).finish({})
 
   monkeypatch.setattr(scheduler.time, 'sleep', sleep)
   said = _sweep(_SMALL, tmp_path, engine)

@@ -253,7 +253,7 @@ def test_the_two_calls_of_a_provider_look_alike():
 
 def test_a_measurement_cannot_look_for_registers_later():
   world = _world('difference', 'meters=[{measures: test_late, writes: score}]')
-  with pytest.raises(errors.RealabError, match=r'ask in `connect`'):
+  with pytest.raises(errors.RealabError, match=r'ask for it in `connect`'):
     world.solver()
 
 
