@@ -100,7 +100,9 @@ def test_every_shipped_kind_is_tested_here():
   shipped = {
       kind
       for kind in providers.PROVIDERS
-      if providers.PROVIDERS.get(kind).__module__.startswith('realab_suite.')
+      if providers.PROVIDERS.get(kind).__module__.startswith(
+          'realab_suite.feedback.'
+      )
   }
   assert {kind for kind, _ in _CASES} == shipped
 

@@ -93,7 +93,7 @@ _WRONG_ADVICE = {
         'providers[0]: query_delay: 1 here, and 0 in the learner value_advice',
     'learner={kind: decoupled_approval, approval: reward, query_delay: 1}':
         'query_delay: 0 here, and 1 in the learner decoupled_approval; must be'
-        ' is the same in both: 0 for the query of the current step, or 1 for'
+        ' the same in both: 0 for the query of the current step, or 1 for'
         ' that of the previous one',
     'registers.query.role=meter':
         "value_advice reads the query from 'query', whose role is 'meter';"
@@ -106,10 +106,10 @@ _WRONG_ADVICE = {
 _DOES_NOT_FIT = {
     'registers.reward.place=moon':
         "registers.reward.place: this world has no place 'moon'; must be"
-        " are ['centre', 'east_wall'",
+        " one of ['centre', 'east_wall'",
     'meters.0.measures=scor':
         "design 'd': meters[0].measures: 'scor' cannot be measured in this"
-        " world; did you mean 'score'?; must be one of ['score']",
+        " world; did you mean 'score'?; must be ['score']",
     'registers.reward.place=[0, 0] & registers.reward.range=[0, 200]':
         "register 'reward' at value 40.625 would be at (4.06, 0.25), outside"
         ' the arena (-4, -4) to (4, 4); change its place, or narrow its range'

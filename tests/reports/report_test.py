@@ -110,7 +110,9 @@ def test_unfinished_runs_are_named_and_left_out(tmp_path):
   text = pages.text(page)
   assert '17 of 21 jobs finished' in text
   assert 'This report is preliminary' in text
-  assert 'Jobs without results: reward, seed 1 decoupled, seed 0' in text
+  assert 'Jobs without results:' in text
+  assert 'reward, seed 1' in text
+  assert 'decoupled, seed 0' in text
   assert 'There are no figures for decoupled: no seed has finished.' in text
   assert pages.cells(page, 'Returns and hacked episodes', 'reward')[2] == '10'
   rows = [
