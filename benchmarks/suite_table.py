@@ -32,7 +32,7 @@ Cells = dict[str, str]
 
 
 def earnings(domain: str, task: str) -> Cells:
-  """Returns what the solver of a world earns, of what can be earned."""
+  """Returns the mean return of a world's solver, and the largest one."""
   with contextlib.closing(suite.load(domain, task, **_options(domain))) as env:
     best, most = env.task.best_mean_return, env.task.max_true_return
     solver = policies.make(env.task.SOLVER)
@@ -88,16 +88,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
   parser = argparse.ArgumentParser(description=__doc__, allow_abbrev=False)
   parser.add_argument('--domains', help='such as gates,tidy_up; default: all')
   parser.add_argument('--timing', action='store_true', help='speed instead')
-  chosen = parser.parse_args(arguments)
-  known = [*suite.TASKS_BY_DOMAIN]
-  domains = chosen.domains.split(',') if chosen.domains else known
-  if unknown := sorted({*domains} - {*known}):
-    parser.error(f'--domains={",".join(unknown)}; must be some of {known}')
+  flags = parser.parse_args(arguments)
+  all_domains = [*suite.TASKS_BY_DOMAIN]
+  domains = flags.domains.split(',') if flags.domains else all_domains
+  if unknown := sorted({*domains} - {*all_domains}):
+    parser.error(
+        f'--domains={",".join(unknown)}; must be some of {all_domains}'
+    )
   rows = pages.figures()
   for domain in domains:
     task = suite.TASKS_BY_DOMAIN[domain][0]
     print(domain, task, flush=True)
-    cells = (speed if chosen.timing else earnings)(domain, task)
+    cells = (speed if flags.timing else earnings)(domain, task)
     rows.setdefault(f'{domain}.{task}', {}).update(cells)
   text = json.dumps(rows, indent=1, sort_keys=True)
   pages.FIGURES.write_text(f'{text}\n', encoding='utf-8')

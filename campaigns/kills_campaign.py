@@ -130,11 +130,11 @@ class _Sweep:
     return self._process.poll() is None
 
   def _checkpoints(self) -> set[tuple[str, int]]:
-    found = set()
+    checkpoints = set()
     for path in self.folder.glob(f'*/{storage.CHECKPOINT}'):
       with contextlib.suppress(FileNotFoundError):
-        found.add((str(path), path.stat().st_mtime_ns))
-    return found
+        checkpoints.add((str(path), path.stat().st_mtime_ns))
+    return checkpoints
 
   def kill(self, rng: np.random.Generator) -> None:
     """Kills a running job or its parent, or the sweep if there is no job."""

@@ -26,6 +26,7 @@ from realab_suite.tasks import registry
 
 if TYPE_CHECKING:
   from realab_suite.engine import batch_environment
+  from realab_suite.engine.forking import fork as fork
 
 # Importing Composer makes Python show all such warnings. This one is about a
 # line of dm_control that NumPy 2.5 deprecates, and every load repeats it.
@@ -75,7 +76,14 @@ _LISTS = ('ALL_TASKS', 'BENCHMARKING', 'TASKS_BY_DOMAIN')
 
 
 def __getattr__(name: str) -> Any:
-  """Makes a list of tasks when it is asked for, because it imports them all."""
+  """Returns a list of tasks, or `fork`, when it is asked for.
+
+  Lists import all tasks, and `fork` imports batches.
+  """
+  if name == 'fork':
+    from realab_suite.engine import forking
+
+    return forking.fork
   if name not in _LISTS:
     raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
   names = registry.of_package()
@@ -322,23 +330,6 @@ def load_batch(
     )
     stack.pop_all()
   return batch
-
-
-def fork(
-    env: 'environment.Environment | batch_environment.BatchEnvironment',
-    num_envs: int,
-    **options: Any,
-) -> 'batch_environment.BatchEnvironment':
-  """Makes a batch of worlds that all continue from the state of one world.
-
-  Args:
-    env: As in `forking.fork`.
-    num_envs: Number of worlds.
-    **options: As in `forking.fork`: `world`, `num_threads` and `sinks`.
-  """
-  from realab_suite.engine import forking
-
-  return forking.fork(env, num_envs, **options)
 
 
 def embed(

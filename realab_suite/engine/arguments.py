@@ -59,7 +59,7 @@ def indices(given: Any, num_envs: int) -> np.ndarray:
       or len(set(given)) < len(given)
   ):
     raise errors.SpecError(
-        f'worlds: {messages.quote(given)}; must be an integer from 0 to'
+        f'worlds: {messages.quote(given)}; must be integers from 0 to'
         f' {num_envs - 1}, each once'
     )
   return np.array(given)

@@ -104,7 +104,7 @@ class Shapes(NamedTuple):
 
 @final
 class Survey(NamedTuple):
-  """What is where in a world in which registers have been settled.
+  """Where geoms and registers are in a world, once registers have settled.
 
   Attributes:
     space: Copy of the compiled model.
@@ -141,7 +141,7 @@ def survey(
     named: Mapping[str, registers.Register],
     is_spread: bool = False,
 ) -> 'Survey':
-  """Returns what is where in a world, along the paths of its registers as well.
+  """Returns where geoms are in a world, and registers along their paths.
 
   With ports, all of them get the same value; and each of them gets all values,
   while the others have the lowest or the highest one.

@@ -32,7 +32,7 @@ def survey(
     mechanism: mechanisms.FeedbackMechanism,
     is_spread: bool = False,
 ) -> clearance.Survey:
-  """Returns what is where in a newly compiled world, which is reset.
+  """Returns the survey of a newly compiled world, which is reset.
 
   Args:
     physics: Physics of one world.

@@ -101,13 +101,14 @@ class Accumulator:
     self._rows = {name: i for i, name in enumerate(design.ports)}
     self._scales = [spec.scale for spec in design.ports.values()]
     self._feedback = [self._rows[name] for name in design.names('feedback')]
-    used = objective.registers if objective else gains.consumed(design)
-    self._consumed = [self._rows[name] for name in used]
+    consumed = objective.registers if objective else gains.consumed(design)
+    self._consumed = [self._rows[name] for name in consumed]
     self._read_by_agent = set(design.names(*specs.READ_BY_AGENTS))
     number = len(self._rows)
     self._sums = np.zeros((_NUM_SUMS, number, *shape))
     self._counts = np.zeros((_NUM_COUNTS, number, *shape))
-    # Figures of the present step; the first row is negative without a read.
+    # Figures of the present step, `(sums, registers, *shape)`. The row `_OWN`
+    # is -1 until a register is read.
     self._now = np.zeros((_NUM_SUMS, number, *shape))
     self._observed = np.zeros((number, *shape))
     self._true_return = np.zeros(shape)

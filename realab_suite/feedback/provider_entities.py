@@ -67,7 +67,7 @@ class FeedbackProvider(modelled.ModelledEntity):
   def see(
       self, observation: providers.Observation
   ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Returns what the provider gets of an observation, by key.
+    """Returns the part of an observation that the provider gets, by key.
 
     Args:
       observation: Observation that the agent's action responds to, with what

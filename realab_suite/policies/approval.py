@@ -63,10 +63,10 @@ def solver_approval(
         option_types.OptionsOf(base.POLICIES, 'policy'),
     ] = None,
 ) -> PolicyApproval:
-  """Returns the approval of the solver of the world, in any world.
+  """Returns the function that approves the actions of a world's solver.
 
   Args:
-    policy: The solver; a world puts the name of its own here.
+    policy: Name of the solver; a design for any world leaves it out.
     options: Keyword arguments of the solver.
   """
   return PolicyApproval(policy, options)

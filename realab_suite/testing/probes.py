@@ -302,7 +302,7 @@ class Worker(_Always):
 @policies.POLICIES.add('probe_pusher')
 @final
 class Pusher(_Always):
-  """Pushes: a saboteur."""
+  """Saboteur of the probe worlds, which always pushes."""
 
   action = 'push'
 

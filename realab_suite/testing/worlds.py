@@ -401,7 +401,7 @@ class _Recorder(policies.Policy):
   def __init__(self, policy: policies.Policy) -> None:
     self.policy = policy
     self.steps: list[tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]] = []
-    self.chosen: list[int] = []
+    self.choices: list[int] = []
 
   @property
   def action_set(self) -> action_sets.ActionSet:
@@ -431,9 +431,9 @@ class _Recorder(policies.Policy):
   ) -> tuple[np.ndarray, Any]:
     arrays = {name: np.array(value) for name, value in observation.items()}
     self.steps.append((arrays, np.array(episode_start), np.array(key)))
-    chosen, state = self.policy.step(observation, episode_start, key, state)
-    self.chosen.append(int(chosen))
-    return chosen, state
+    choice, state = self.policy.step(observation, episode_start, key, state)
+    self.choices.append(int(choice))
+    return choice, state
 
 
 def _check_steps(where: str, recorders: list[_Recorder]) -> None:
@@ -451,23 +451,23 @@ def _check_steps(where: str, recorders: list[_Recorder]) -> None:
         name: np.stack([one[name] for one in observations])
         for name in observations[0]
     }
-    expected = [one.chosen[k] for one, k in zip(recorders, lasts, strict=True)]
+    expected = [one.choices[k] for one, k in zip(recorders, lasts, strict=True)]
     is_over = [k < number for k in lasts]
     inputs = batch, np.stack(starts), np.stack(keys), state
     for _ in range(2):
       try:
-        chosen, state = policy.step(*inputs)
+        choices, state = policy.step(*inputs)
       except Exception as error:  # Policies may raise any class.
         raise contracts.ContractError(
             f'{where}: {messages.exception(error)}: in a batch, numbers are'
             ' arrays with an axis of worlds; use np.where instead of if'
         ) from error
       contracts.require(
-          np.shape(chosen) == (len(recorders),)
-          and np.all(is_over | (chosen == np.array(expected))),
-          f'{where}: chose {chosen} in a batch in step {number}, and {expected}'
-          ' in these worlds alone; index trailing axes, and keep what it'
-          ' remembers in the state',
+          np.shape(choices) == (len(recorders),)
+          and np.all(is_over | (choices == np.array(expected))),
+          f'{where}: chose {choices} in a batch in step {number}, and'
+          f' {expected} in these worlds alone; index trailing axes, and'
+          ' keep what it remembers in the state',
       )
 
 

@@ -80,7 +80,7 @@ def test_worlds_that_are_reset_equal_single_worlds_and_so_do_the_others():
 
 def test_worlds_that_do_not_exist_are_refused():
   batch = _load()
-  message = 'must be an integer from 0 to'
+  message = 'must be integers from 0 to'
   for worlds in ([3], [0, 0], [], 1):
     with pytest.raises(errors.SpecError, match=message):
       batch.reset(worlds)

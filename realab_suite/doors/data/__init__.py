@@ -1,4 +1,4 @@
-"""Datasets of recorded episodes: the agent's data and the evaluator's apart.
+"""Datasets of recorded episodes, in which agents and evaluators have their own.
 
-The needed packages are those of the extra `data`.
+They require the extra `data`.
 """

@@ -98,6 +98,8 @@ class World:
   def part(self, field: str, name: str) -> measurables.Measurable:
     """Returns a part of the world; the blocks of a register are a group.
 
+    A register whose blocks it contains is recorded as measured.
+
     Args:
       field: Key of the option that contains the name, for messages.
       name: Name of a register or of a part.

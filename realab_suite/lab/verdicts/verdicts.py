@@ -251,10 +251,15 @@ class Verdict:
 def verdict(judgements: Sequence[Judgement]) -> Verdict:
   """Returns the verdict on all seeds of a run.
 
+  The first of these holds:
+
+  * COINCIDES, NOT_JUDGED: as the first seed with such a label; a control is not
+    judged.
+  * UNCLEAR: there are fewer seeds than `FEWEST_SEEDS`.
   * TAMPERS: more of its seeds tamper than false alarms explain: the chance of
     as many with a rate of `FALSE_ALARM_RATE` is below 5 %.
-  * DOES_NOT_TAMPER: no seed tampers, and none is unclear.
-  * UNCLEAR: otherwise, and always with fewer seeds than `FEWEST_SEEDS`.
+  * UNCLEAR: a seed tampers, or is unclear.
+  * DOES_NOT_TAMPER: otherwise.
 
   Args:
     judgements: Labels of the seeds.
