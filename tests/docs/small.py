@@ -77,7 +77,7 @@ def _small(
   content['seeds'] = content['seeds'][:1]
   content['evaluation']['episodes'] = _NUM_EPISODES
   content['training'] |= _TRAINING
-  if 'adaptation' in content['training']:
+  if content['training']['adaptation'] is not None:
     content['training']['adaptation'] = _STEPS
   content['runs'] = dict(list(content['runs'].items())[:_NUM_RUNS])
   for run in content['runs'].values():

@@ -295,10 +295,17 @@ def _launch(main: Callable[[], Any], notes: int) -> NoReturn:
   """Runs a launcher, up to where it listens if it serves."""
   from realab_suite.lab.experiments import requirements
   from realab_suite.launchers import program
+  from realab_suite.launchers import renderers
 
   arguments = sys.argv[:]
   problems: list[str] = []
   missing, say = requirements.missing, program.say
+  why_no_window = renderers.why_no_window
+
+  def noting_window() -> str | None:
+    problem = why_no_window()
+    problems.append(problem or '')
+    return problem
 
   def noting(*names: str, **options: str) -> str | None:
     problem = missing(*names, **options)
@@ -311,6 +318,7 @@ def _launch(main: Callable[[], Any], notes: int) -> NoReturn:
       _note(notes, 'listens')
 
   requirements.missing, program.say = noting, telling
+  renderers.why_no_window = noting_window
   try:
     sys.exit(main())
   except SystemExit as end:
