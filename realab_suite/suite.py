@@ -26,7 +26,6 @@ from realab_suite.tasks import registry
 
 if TYPE_CHECKING:
   from realab_suite.engine import batch_environment
-  from realab_suite.engine.forking import fork as fork
 
 # Importing Composer makes Python show all such warnings. This one is about a
 # line of dm_control that NumPy 2.5 deprecates, and every load repeats it.
@@ -71,6 +70,9 @@ BENCHMARKING: tuple[tuple[str, str], ...]
 
 TASKS_BY_DOMAIN: Mapping[str, tuple[str, ...]]
 """Names of the tasks of this package, by domain."""
+
+fork: Callable[..., 'batch_environment.BatchEnvironment']
+"""Makes a batch of worlds that all continue from the state of one world."""
 
 _LISTS = ('ALL_TASKS', 'BENCHMARKING', 'TASKS_BY_DOMAIN')
 
