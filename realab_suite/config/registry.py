@@ -64,8 +64,8 @@ class Registry(Generic[T]):
       hint = messages.did_you_mean(name, [*self])
       raise errors.UnknownNameError(
           f'{self._what} {messages.quote(name)} is unknown{hint}; known are'
-          f' {sorted(self)}; others are known once their module is imported, as'
-          ' by --import'
+          f' {sorted(self)}, and others once their module is imported, as by'
+          ' --import'
       )
     return self._entries[name]
 

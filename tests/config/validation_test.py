@@ -82,8 +82,8 @@ def _register(**changes: Any) -> dict[str, Any]:
         ' (allowed: kind, value)'),
     ({'providers': [{'kind': 'scale'}]},
         "providers[0].kind: provider kind 'scale' is unknown; did you mean"
-        " 'scaled'?; known are ['constant', 'scaled']; others are known"
-        ' once their module is imported, as by --import'),
+        " 'scaled'?; known are ['constant', 'scaled'], and others once"
+        ' their module is imported, as by --import'),
     ({'mixed': [{'type': 'scale', 'range': 1}]},
         'mixed[0].range: must be a list, got 1'),
     # Pydantic's names for the two unions are left out.
