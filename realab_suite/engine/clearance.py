@@ -291,6 +291,13 @@ def _track(physics: Any, register: registers.Register) -> np.ndarray:
   return np.stack(tracks, axis=-2)
 
 
+def _geoms(physics: Any, register: registers.Register) -> np.ndarray:
+  """Returns the index of the geom of each block, `(blocks,)`."""
+  geoms = [block.geom for block in register.blocks]
+  indices: np.ndarray = physics.bind(geoms).element_id
+  return indices
+
+
 def _shapes(
     physics: Any,
     register: registers.Register,
@@ -312,6 +319,7 @@ def _shapes(
   """
   frame = physics.bind(mjcf.get_attachment_frame(register.mjcf_model))
   origin, axes = np.array(frame.xpos), np.reshape(frame.xmat, (3, 3)).copy()
+  geoms = _geoms(physics, register)
   parts = []
   for i, block in enumerate(register.blocks):
     _, first = np.unique(tracks[:, i].round(9), axis=0, return_index=True)
@@ -326,7 +334,7 @@ def _shapes(
       turned = np.eye(3)
     parts.append(
         Shapes(
-            np.full(number, int(physics.bind(block.geom).element_id)),
+            np.full(number, geoms[i]),
             origin + track[:, :3] @ axes.T,
             np.broadcast_to(axes @ turned, (number, 3, 3)),
             half + reach,
@@ -345,9 +353,9 @@ def owners(
   """Returns the names of registers by the geoms that move with their blocks."""
   parents, bodies = physics.model.body_parentid, physics.model.geom_bodyid
   owner_of_body = {
-      int(bodies[physics.bind(block.geom).element_id]): name
+      int(body): name
       for name, register in named.items()
-      for block in register.blocks
+      for body in bodies[_geoms(physics, register)]
   }
   for body, parent in enumerate(parents):  # Parents come first.
     if int(parent) in owner_of_body:

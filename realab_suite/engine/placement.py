@@ -168,13 +168,14 @@ class StartCheck:
     self._root = task.root_entity
     self._registers = mechanism.registers
     self._is_spread = any(r.spread.any() for r in self._registers.values())
-    data = physics.data
-    self._mocap = np.array(data.mocap_pos), np.array(data.mocap_quat)
     self._survey = surveyed = survey(physics, mechanism)
     self._movable = _movable(physics, task, surveyed)
     carriers = physics.model.body_weldid[physics.model.geom_bodyid]
     self._is_part = surveyed.others(physics.model.body_mocapid[carriers] >= 0)
     self._homes = surveyed.select(self._is_part)
+    model, data = physics.model, physics.data
+    self._mocap = np.unique(model.body_mocapid[carriers[self._homes.geoms]])
+    self._home_poses = _mocap_poses(data, self._mocap)
     bodies = surveyed.select(self._movable)
     self._is_needed = bool(self._registers) and bool(
         len(self._homes.geoms) + len(bodies.geoms)
@@ -199,8 +200,8 @@ class StartCheck:
       return
     space = self._survey.space
     data = space.at(physics.state)
-    mocap = data.mocap_pos, data.mocap_quat
-    if not self._movable.any() and all(map(np.array_equal, mocap, self._mocap)):
+    poses = _mocap_poses(data, self._mocap)
+    if not self._movable.any() and np.array_equal(poses, self._home_poses):
       return
     space.update()
     bodies = space.shapes(data, self._movable)
@@ -243,6 +244,11 @@ def _movable(
   return surveyed.others(
       ~surveyed.space.is_fixed & (roots != model.body_rootid[avatar])
   )
+
+
+def _mocap_poses(data: Any, indices: np.ndarray) -> np.ndarray:
+  """Returns positions and quaternions of mocap bodies, `(bodies, 7)`."""
+  return np.hstack([data.mocap_pos[indices], data.mocap_quat[indices]])
 
 
 def _along_ways(

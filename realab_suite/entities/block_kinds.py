@@ -211,9 +211,8 @@ class Block(abc.ABC):
     """Height of the grip above the centre of the block, in m."""
 
   def _bind(self, physics: protocols.Physics) -> None:
-    """Binds the slides, and the first of them, to another physics."""
+    """Binds the slides to another physics."""
     self._moved = physics.bind(self._slides)
-    self._moved_along = physics.bind(self._slides[0])
     self._physics = physics
 
   @abc.abstractmethod
@@ -224,7 +223,7 @@ class Block(abc.ABC):
     """Returns the x coordinate in the register's frame, `(...)`, in m."""
     if physics is not self._physics:
       self._bind(physics)
-    return self._rest[0] + self._moved_along.qpos.T[0]
+    return self._rest[0] + self._moved.qpos.T[0]
 
   @abc.abstractmethod
   def heading(self, physics: protocols.Physics) -> np.ndarray:
@@ -261,10 +260,11 @@ class Block(abc.ABC):
       along = self._free(position, along, self.orientation(physics), is_far)
     position[..., 0] = along
     moved = position[..., :1] - self._rest[:1]
+    slide = physics.bind(self._slides[0])
     if where is None:
-      self._moved_along.qpos = moved
+      slide.qpos = moved
     else:
-      axes.assign(self._moved_along, 'qpos', moved, where)
+      axes.assign(slide, 'qpos', moved, where)
     for grasp in self._grasps:
       if grasp.is_anywhere_held(physics):
         place = self._surroundings.in_world(physics, position)[..., :2]
