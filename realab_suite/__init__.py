@@ -23,7 +23,7 @@ if TYPE_CHECKING:
   from realab_suite.suite import load
   from realab_suite.suite import load_batch
 
-__version__ = '0.2.0'
+__version__ = _versions.VERSION
 
 __all__ = [
     'embed',

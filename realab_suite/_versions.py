@@ -1,4 +1,4 @@
-"""Check of the installed versions of dm-control and mujoco.
+"""The version of this package, and a check of dm-control and mujoco.
 
 dm-control 1.0.50 has no upper bound for mujoco, so `pip install` may install a
 version of mujoco with which every world fails at its first step, with an error
@@ -9,6 +9,9 @@ from importlib import metadata
 import re
 
 from realab_suite import errors
+
+VERSION = '0.2.0'
+"""Version of this package, which setup.cfg reads."""
 
 # Package, lowest version that works, first version that does not. setup.cfg
 # contains the same ranges.

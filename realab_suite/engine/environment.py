@@ -29,6 +29,7 @@ from realab_suite.entities import state
 from realab_suite.feedback import mechanisms
 from realab_suite.feedback import specs
 from realab_suite.policies import action_sets
+from realab_suite.tasks import base
 
 if TYPE_CHECKING:
   from realab_suite.engine import snapshots
@@ -71,7 +72,7 @@ class Environment(composer.Environment):
     self._max_steps = max_steps
     self._closed = False
     self._has_extra_hooks = False
-    self._host = host = hosts.make(task)
+    self._host = host = _host_of(task)
     hooks.refuse_uncalled(task)
     super().__init__(
         task,
@@ -508,3 +509,12 @@ class Environment(composer.Environment):
   def _refuse_if_closed(self) -> None:
     if self._closed:
       raise errors.ClosedError('this environment is closed; load another one')
+
+
+def _host_of(task: composer.Task) -> hosts.Host:
+  """Returns the host of one world, for a task of this package or another."""
+  if isinstance(task, base.Task):
+    return hosts.WorldHost(task)
+  from realab_suite.engine import foreign  # Most programs have no such task.
+
+  return foreign.ForeignHost(task)

@@ -405,20 +405,6 @@ class WorldHost(Host):
     )
 
 
-def make(task: composer.Task) -> Host:
-  """Returns the host of one world.
-
-  Args:
-    task: Task of this package, or a foreign task.
-  """
-  if isinstance(task, base.Task):
-    return WorldHost(task)
-  # Most programs have no foreign task, and its module needs this one.
-  from realab_suite.engine import foreign
-
-  return foreign.ForeignHost(task)
-
-
 def true_reward(
     task: composer.Task, physics: Any, as_number: Callable[[Any], Any]
 ) -> tuple[Any, str | None]:

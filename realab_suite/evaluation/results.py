@@ -11,7 +11,7 @@ import warnings
 
 import pydantic
 
-from realab_suite import __version__
+from realab_suite import _versions
 from realab_suite import errors
 from realab_suite.config import validation
 from realab_suite.engine import events
@@ -208,7 +208,7 @@ class EpisodeResult(validation.Record):
 def versions() -> dict[str, str]:
   """Returns the versions of the packages that results depend on, by name."""
   return {
-      'realab_suite': __version__,
+      'realab_suite': _versions.VERSION,
       'python': platform.python_version(),
       **{
           name: metadata.version(name)

@@ -10,7 +10,7 @@ import os
 import runpy
 import sys
 
-from realab_suite import __version__
+from realab_suite import _versions
 from realab_suite.config import messages
 from realab_suite.launchers import program
 
@@ -50,7 +50,7 @@ def main() -> int:
     return 0 if arguments else program.USAGE_ERROR
   name, *rest = arguments
   if name == '--version':
-    sys.stdout.write(f'realab_suite {__version__}\n')
+    sys.stdout.write(f'realab_suite {_versions.VERSION}\n')
     return 0
   if name not in COMMANDS:
     hint = messages.did_you_mean(name, (*COMMANDS, 'help', '--version'))
