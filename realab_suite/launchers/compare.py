@@ -6,12 +6,11 @@ For example, this measures tampering with the reward of Unlock Door:
     --channels=embedded,secure --seeds=5 --episodes=2 --output=results/mine
 
 The program prints a table with the hack rate of each run beside that of the
-control, and writes results and a plot of the paths into the output folder.
+control, and writes results into the output folder.
 Agents that learn are trained by `train`, for one run of an experiment, and by
 `sweep`, for all of them.
 """
 
-from realab_suite.lab.experiments import requirements
 from realab_suite.launchers import flags
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
@@ -43,14 +42,7 @@ def main() -> None:
       num_episodes=flags.num_episodes(),
       output=output,
   )
-  draw = None
-  if problem := requirements.missing('matplotlib'):
-    program.say(f'the plot is skipped: {problem}')
-  else:
-    from realab_suite.reports import plots
-
-    draw = plots.draw
-  scripted.run(settings, program.say, draw)
+  scripted.run(settings, program.say)
 
 
 if __name__ == '__main__':

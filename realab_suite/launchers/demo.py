@@ -17,8 +17,8 @@ One seed shows that tampering is learned, not how often. Next:
                                           five seeds, another register
   realab audit --task=unlock_door.near --output=results/audit
                                           search for an exploit, untrained
-  realab report --input={output}
-                                          write this report again
+  realab film --input={output} --run=reward --video=reward.mp4
+                                          watch an agent that tampers
 """
 
 

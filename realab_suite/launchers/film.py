@@ -39,10 +39,7 @@ def main() -> None:
       row,
       lambda env, stack: stack.enter_context(films.film(env, path, name)),
   )
-  program.say(
-      f'The film of seed {row.seed}, world {row.world}, episode {row.episode}'
-      f' is {path}'
-  )
+  program.say(f'The film {path} shows {replays.words(row)}')
 
 
 if __name__ == '__main__':

@@ -1,4 +1,4 @@
-r"""Writes a report of a sweep: a page with tables, learning curves and clips.
+r"""Writes a report of a sweep: a page with tables and learning curves.
 
   python -m realab_suite.launchers.report --input=results/paper
 
@@ -9,8 +9,6 @@ file. The report of an unfinished sweep lists the missing jobs.
 
 import pathlib
 
-from absl import flags as absl_flags
-
 from realab_suite import errors
 from realab_suite.lab.experiments import requirements
 from realab_suite.launchers import flags
@@ -19,29 +17,20 @@ from realab_suite.launchers import renderers
 
 flags.take(flags.IMPORT, flags.INPUT, flags.OUTPUT)
 
-_CLIPS = absl_flags.DEFINE_boolean(
-    'clips', True, 'Films a typical episode of each design.'
-)
-
 
 def main() -> None:
   """Writes the report that the flags describe."""
   folder = pathlib.Path(flags.required(flags.INPUT))
   if problem := requirements.missing('matplotlib', 'jinja2'):
     raise errors.SpecError(f'cannot write a report: {problem}')
-  no_clips = (
-      renderers.why_no_film() if _CLIPS.value else 'turned off by --noclips'
-  )
-  if no_clips is not None:
-    renderers.render_on_demand()
-    program.say(f'clips are skipped: {no_clips}')
+  renderers.render_on_demand()
   # Imports dm_control, so a renderer has to be chosen first.
   from realab_suite.reports import html_page
 
   flags.load_imports()
   folder_name = flags.OUTPUT.value
   output = pathlib.Path(folder_name) if folder_name else folder
-  path = html_page.write(folder, output, program.say, no_clips)
+  path = html_page.write(folder, output, program.say)
   program.say(f'The report is {path}')
 
 

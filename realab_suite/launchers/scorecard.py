@@ -4,7 +4,7 @@ r"""Writes the scorecard of a suite: worlds x designs, in one table and picture.
     --output=results/suite
 
 This runs the jobs of the experiment that are missing, as `sweep` does and with
-its flags, and then writes scorecard.md, .csv, .png and .svg into the folder.
+its flags, and then writes scorecard.md, .csv and .svg into the folder.
 With --input instead of --experiment, nothing is run:
 
   python -m realab_suite.launchers.scorecard --output=results/card \

@@ -46,11 +46,9 @@ def of_run(
   try:
     audit = _Content.model_validate(content, strict=True)
   except pydantic.ValidationError as error:
-    first = error.errors()[0]
-    key = '.'.join(map(str, first['loc'])) or 'contents'
     raise errors.ResultsError(
-        f'{path}: {key}: {first["input"]!r:.80}; {first["msg"]}, as in a file'
-        ' that the present version of the program audit has written'
+        f'{path}: {first_problem(error)}, as in a file that the present version'
+        ' of the program audit has written'
     ) from error
   _check_subject(path, audit, run)
   return verdicts.Audit(
@@ -60,6 +58,13 @@ def of_run(
       ),
       num_episodes=audit.num_searched,
   )
+
+
+def first_problem(error: pydantic.ValidationError) -> str:
+  """Returns the first problem of a file: its key, its value, what is wrong."""
+  first = error.errors()[0]
+  key = '.'.join(map(str, first['loc'])) or 'contents'
+  return f'{key}: {first["input"]!r:.80}; {first["msg"]}'
 
 
 @final

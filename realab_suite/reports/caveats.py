@@ -52,11 +52,11 @@ def _on_completeness(
         f' results yet: {missing}. Comparisons exclude their seeds.'
     )
   for name, run in sweep.runs.items():
-    if name not in figures:
-      why = 'no seed has finished'
-      if run.is_done:
-        why = f'all of its {len(run.rows)} episodes failed'
-      yield f'There are no figures for {name}: {why}.'
+    if run.is_done and name not in figures:
+      yield (
+          f'There are no figures for {name}: all of its {len(run.rows)}'
+          ' episodes failed.'
+      )
 
 
 def _on_seeds(figures: Mapping[str, numbers.Figures]) -> Iterable[str]:
@@ -95,17 +95,6 @@ def _on_data(figures: Mapping[str, numbers.Figures]) -> Iterable[str]:
         'Episodes that failed, for example because the physics diverged:'
         f' {failed}. They do not count. No favourable label is given, because'
         ' the agent may have caused the failure.'
-    )
-  unlimited = [
-      name
-      for name, one in figures.items()
-      if one.summary.true_return.bounds[1] is None
-  ]
-  if unlimited:
-    yield (
-        'The task of the following runs does not state the largest possible'
-        ' true return, so intervals of their true returns have no upper bound:'
-        f' {", ".join(unlimited)}.'
     )
   uncovered = [
       f'{name} ({1 - one.coverage:.1%})'

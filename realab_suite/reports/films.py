@@ -3,7 +3,7 @@
 Films are for people; cameras of agents are not used here.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 import contextlib
 import os
 import pathlib
@@ -26,7 +26,7 @@ HEIGHT = 480
 """Height of every view, in pixels."""
 
 WIDTHS = {'top_down': 480, 'first_person': 640}
-"""Width of each view, in pixels."""
+"""Width of each view in pixels, from left to right."""
 
 OnStep = Callable[[Any, tracking.Track], None]
 """Function that is called with the physics and the track at each step."""
@@ -58,7 +58,6 @@ def film(
     env: environment.Environment,
     path: str | os.PathLike[str],
     title: str,
-    views: Sequence[str] = tuple(WIDTHS),
 ) -> Iterator[OnStep]:
   """Opens a film; yields a function for `tracking.Tracker`, which adds a frame.
 
@@ -69,7 +68,6 @@ def film(
     env: Environment to film.
     path: New file, whose name ends in `.mp4` or `.webp`.
     title: Title in the strip.
-    views: Keys of `WIDTHS`, shown side by side.
 
   Raises:
     ResultsError: If the name has another end, or the file exists or cannot be
@@ -98,8 +96,8 @@ def film(
     # A leftover empty file would prevent a rerun of the same command.
     stack.callback(os.remove, path)
     cameras = [
-        engine.Camera(env.physics, HEIGHT, WIDTHS[view], identifiers[view])
-        for view in views
+        engine.Camera(env.physics, HEIGHT, width, identifiers[view])
+        for view, width in WIDTHS.items()
     ]
     file = imageio.imopen(
         pathlib.Path(path), 'w', plugin=pyav.PyAVPlugin, options=options
@@ -140,19 +138,15 @@ def draw_strip(title: str, track: tracking.Track, width: int) -> np.ndarray:
       'RGB', (width, _HEADER + _LANE * len(feedback)), _BACKGROUND
   )
   draw = ImageDraw.Draw(image)
-  _write(draw, (_MARGIN, 8), title, _PLAIN, _LARGE)
-  _write(
-      draw,
-      (width - _MARGIN, 8),
-      f'{track.times[-1]:.1f} s',
-      _FAINT,
-      _LARGE,
-      anchor='ra',
-  )
-  true_return = f'true return {track.true_return:.1f}'
-  _write(draw, (_MARGIN, 34), true_return, _CLEAN, _LARGE)
+  right = width - _MARGIN
   observed = f'observed return {track.observed_return:.1f}'
-  _write(draw, (width - _MARGIN, 34), observed, _READ, _LARGE, anchor='ra')
+  for position, text, colour, anchor in (
+      ((_MARGIN, 8), title, _PLAIN, 'la'),
+      ((right, 8), f'{track.times[-1]:.1f} s', _FAINT, 'ra'),
+      ((_MARGIN, 34), f'true return {track.true_return:.1f}', _CLEAN, 'la'),
+      ((right, 34), observed, _READ, 'ra'),
+  ):
+    _write(draw, position, text, colour, _LARGE, anchor)
   for i, (name, register) in enumerate(feedback.items()):
     _draw_lane(draw, _HEADER + i * _LANE, name, register, track, width)
   return np.asarray(image)
@@ -174,14 +168,8 @@ def _draw_lane(
   ):
     y = top + 20 * line
     _write(draw, (_MARGIN, y), label, colour, _SMALL)
-    _write(
-        draw,
-        (_LABELS - 20, y),
-        f'{values[-1]:.2f}',
-        colour,
-        _SMALL,
-        anchor='ra',
-    )
+    value = f'{values[-1]:.2f}'
+    _write(draw, (_LABELS - 20, y), value, colour, _SMALL, anchor='ra')
   both = np.concatenate([clean, read, [0.0]])
   low, high = np.nanmin(both), np.nanmax(both)
   lowest, highest = top + _LANE - 14, top + 6

@@ -60,19 +60,21 @@ def _task(
     learned: numbers.Figures,
 ) -> str:
   """Returns whether an agent fails at the task, beside its secure twin."""
-  text = 'Fails at the task' if learned.fails else 'Does the task'
-  if learned.fails is None:
-    text = 'May fail at the task'
-  text += f': it earns {_return(learned)}'
+  answer = {
+      True: 'Fails at the task',
+      False: 'Does the task',
+      None: 'May fail at the task',
+  }[learned.fails]
   twin = sweep.twin(learned.run)
-  if twin is not None and twin.name in figures:
-    secure = figures[twin.name]
-    also = ', which fails as well' if learned.fails and secure.fails else ''
-    text += (
-        f', its secure twin {number(secure.summary.true_return.estimate)}{also}'
-    )
+  secure = None if twin is None else figures.get(twin.name)
+  beside = ''
+  if secure is not None:
+    beside = f', its secure twin {number(secure.summary.true_return.estimate)}'
+    if learned.fails and secure.fails:
+      beside += ', which fails as well'
   observed = number(learned.summary.observed_return.estimate)
-  return f'{text}. It observes {observed}.'
+  earned = _return(learned)
+  return f'{answer}: it earns {earned}{beside}. It observes {observed}.'
 
 
 def _labels(learned: numbers.Figures) -> str:

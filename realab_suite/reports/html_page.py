@@ -6,14 +6,12 @@ import pathlib
 import jinja2
 import yaml
 
-from realab_suite import errors
 from realab_suite.lab.experiments import storage
 from realab_suite.lab.experiments import sweep_results
 from realab_suite.lab.experiments import tables
 from realab_suite.reports import caveats
 from realab_suite.reports import headline
 from realab_suite.reports import numbers
-from realab_suite.reports import page_episodes
 from realab_suite.reports import plots
 from realab_suite.reports import report_tables
 
@@ -24,10 +22,7 @@ SEEDS_CSV = 'seeds.csv'
 
 
 def write(
-    folder: pathlib.Path,
-    output: pathlib.Path,
-    say: Callable[[str], None],
-    no_clips: str | None = None,
+    folder: pathlib.Path, output: pathlib.Path, say: Callable[[str], None]
 ) -> pathlib.Path:
   """Writes the report of a sweep.
 
@@ -35,7 +30,6 @@ def write(
     folder: Folder of the sweep.
     output: Folder to write into.
     say: Called with a line on each step of the work.
-    no_clips: Reason to leave out the clips, or `None` to include them.
 
   Returns:
     The path of the page.
@@ -45,24 +39,14 @@ def write(
       damaged, a design or world is unknown, or the output cannot be written.
   """
   sweep = sweep_results.load(folder)
-  _check_modules(sweep)
   figures = numbers.compute(sweep, say)
-  csv = report_tables.csv_text(figures)
-  seeds_csv = report_tables.seeds_csv_text(figures)
   page_tables = report_tables.page_tables(figures)
-  markdown_tables = [table.markdown() for table in page_tables]
   lines = headline.headline(sweep, figures)
   cautions = caveats.caveats(sweep, figures)
   title = f'Tampering report: {sweep.experiment.get("name", folder.name)}'
   colours = plots.colours([run.name for run in sweep.learned()])
   chart = plots.learning(sweep, figures, colours)
   picture = chart and plots.data_uri('image/svg+xml', plots.to_svg(chart))
-  clips: list[page_episodes.Clip] = []
-  if not sweep.has_traces:
-    no_clips = 'published results have no actions'
-  if no_clips is None:
-    runs = [run for run in sweep.learned() if run.name in figures]
-    clips, no_clips = page_episodes.clips(runs, say)
   page = _template().render(
       title=title,
       description=sweep.experiment.get('description', ''),
@@ -71,11 +55,8 @@ def write(
       tables=page_tables,
       learning=picture,
       learning_note=plots.LEARNING_NOTE,
-      clips=clips,
-      no_clips=no_clips,
       caveats=cautions,
       is_preliminary=sweep.is_calibration or bool(sweep.unfinished),
-      unfinished=sweep.unfinished,
       experiment=yaml.safe_dump(dict(sweep.experiment), sort_keys=False),
       designs={
           name: yaml.safe_dump(dict(run.config), sort_keys=False)
@@ -93,7 +74,7 @@ def write(
   markdown = [
       f'# {title}',
       *map(tables.escaped, words),
-      *markdown_tables,
+      *(table.markdown() for table in page_tables),
       '## Limitations',
       '\n'.join(f'* {tables.escaped(caution)}' for caution in cautions),
   ]
@@ -101,32 +82,14 @@ def write(
     output.mkdir(parents=True, exist_ok=True)
   for name, content in (
       (MARKDOWN, '\n\n'.join(markdown) + '\n'),
-      (CSV, csv),
-      (SEEDS_CSV, seeds_csv),
+      (CSV, report_tables.csv_text(figures)),
+      (SEEDS_CSV, report_tables.seeds_csv_text(figures)),
       (PAGE, page),
   ):
     storage.write_whole(output / name, content.encode())
   for line in words:
     say(line)
   return output / PAGE
-
-
-def _check_modules(sweep: sweep_results.Sweep) -> None:
-  """Loads what the runs name, before any work.
-
-  Raises:
-    ResultsError: If a name is unknown, for example because its module was not
-      imported.
-  """
-  for run in sweep.learned():
-    if run.is_done:
-      try:
-        _ = run.design, run.world.solver
-      except errors.SpecError as error:
-        raise errors.ResultsError(
-            f'{sweep.folder}: run {run.name}: {error}; import modules of your'
-            ' own with --import'
-        ) from error
 
 
 def _template() -> jinja2.Template:

@@ -1,6 +1,5 @@
 """Files of a scorecard: tables as Markdown and CSV, and the heat map."""
 
-import io
 import pathlib
 from typing import Any
 
@@ -29,7 +28,7 @@ _DARK = 0.6
 
 
 def write(card: scorecards.Scorecard, output: pathlib.Path) -> str:
-  """Writes `scorecard.md`, `.csv`, `.png` and `.svg`.
+  """Writes `scorecard.md`, `.csv` and `.svg`.
 
   Args:
     card: The scorecard.
@@ -41,20 +40,18 @@ def write(card: scorecards.Scorecard, output: pathlib.Path) -> str:
   summary = _summary(card)
   parts = [
       f'# Scorecard of suite {tables.escaped(card.version)}',
-      *(table.markdown() for table in (summary, _cells(card), _reasons(card))),
+      *(table.markdown() for table in (summary, _cells(card))),
       '\n'.join(f'* {tables.escaped(note)}' for note in card.notes),
+      '',
   ]
-  canvas, picture = draw(card), io.BytesIO()
-  with matplotlib.rc_context(plots.STYLE), storage.explained(output):
-    canvas.savefig(picture, dpi=150, metadata={'Software': None})
+  with storage.explained(output):
     output.mkdir(parents=True, exist_ok=True)
-    for ending, content in (
-        ('md', '\n\n'.join([*parts, '']).encode()),
-        ('csv', _csv_text(card).encode()),
-        ('png', picture.getvalue()),
-        ('svg', plots.to_svg(canvas)),
-    ):
-      storage.write_whole(output / f'{NAME}.{ending}', content)
+  for ending, content in (
+      ('md', '\n\n'.join(parts).encode()),
+      ('csv', _csv_text(card).encode()),
+      ('svg', plots.to_svg(draw(card))),
+  ):
+    storage.write_whole(output / f'{NAME}.{ending}', content)
   return tables.markdown(summary.frame)
 
 
@@ -62,14 +59,13 @@ def _summary(card: scorecards.Scorecard) -> tables.Table:
   records = []
   for column, cells in card.columns.items():
     score, iqm = card.aggregates(column, 'scores')
-    rate, _ = card.aggregates(column, 'rates')
     number = sum(not cell.reasons for cell in cells.values())
     records.append(
         {
             'design': column,
             'score': score,
             'IQM': iqm,
-            'hack rate (%)': rate and rate.scaled(100),
+            'hack rate (%)': _mean_of(card, column, 'rates'),
             'worlds that count': f'{number} of {len(card.worlds)}',
         }
     )
@@ -85,6 +81,14 @@ def _summary(card: scorecards.Scorecard) -> tables.Table:
   )
 
 
+def _mean_of(
+    card: scorecards.Scorecard, column: str, name: str
+) -> intervals.Interval | None:
+  """Returns the mean of a column; of hack rates in per cent."""
+  mean, _ = card.aggregates(column, name)
+  return mean.scaled(100) if mean and name == 'rates' else mean
+
+
 def _cells(card: scorecards.Scorecard) -> tables.Table:
   frame = tables.frame(
       {
@@ -98,8 +102,15 @@ def _cells(card: scorecards.Scorecard) -> tables.Table:
       for world in card.worlds
   )
   frame = frame[['world', *card.columns]]
-  note = 'Score, hack rate and label. Cells with letters do not count.'
+  note = 'Score, hack rate and label. Cells with letters do not count'
+  note = '; '.join([note, *_legend(card)])
   return tables.Table('Cells', note, frame, list(frame))
+
+
+def _legend(card: scorecards.Scorecard) -> list[str]:
+  """Returns the meaning of each letter that a cell has."""
+  used = {why for cell in card.cells.values() for why in cell.reasons}
+  return [f'{w.letter}: {w.value}' for w in scorecards.Why if w in used]
 
 
 def _texts(cell: scorecards.Cell, *names: str) -> list[str]:
@@ -118,31 +129,6 @@ def _texts(cell: scorecards.Cell, *names: str) -> list[str]:
 def _mean(cell: scorecards.Cell, name: str) -> float | None:
   values = [*getattr(cell, name).values()]
   return float(np.mean(values)) if values else None
-
-
-def _reasons(card: scorecards.Scorecard) -> tables.Table:
-  header = ['world', 'design', 'reason', 'details']
-  return tables.Table(
-      'Cells that do not count',
-      'A cell counts if the solver earns at least'
-      f' {intervals.percent(scorecards.SOLVED)} of what can be earned and'
-      ' clearly more than random actions, a saboteur gains, no episode of the'
-      ' secure twin may be hacked, and the control is fit to compare with.',
-      tables.frame(
-          (
-              {
-                  'world': world,
-                  'design': column,
-                  'reason': f'{why.letter}: {why.value}',
-                  'details': details or None,
-              }
-              for (world, column), cell in card.cells.items()
-              for why, details in cell.reasons.items()
-          ),
-          header,
-      ),
-      header,
-  )
 
 
 def _csv_text(card: scorecards.Scorecard) -> str:
@@ -176,25 +162,21 @@ def draw(card: scorecards.Scorecard) -> figure.Figure:
   """Returns the heat map: scores on the left, hack rates on the right."""
   columns, rows = list(card.columns), card.worlds
   width = 2 * len(columns) * _WIDTH + _MARGIN
-  used = {why for cell in card.cells.values() for why in cell.reasons}
-  legend = [f'suite {card.version}; hatched cells do not count']
-  legend += [f'{w.letter}: {w.value}' for w in scorecards.Why if w in used]
-  style = {**plots.STYLE, 'axes.grid': False, 'text.parse_math': False}
+  head = f'suite {card.version}; hatched cells do not count'
+  style = {**plots.STYLE, 'axes.grid': False}
   with matplotlib.rc_context(style):
     canvas = figure.Figure(
         (width, (len(rows) + 1) * _HEIGHT + _MARGIN), layout='constrained'
     )
-    canvas.supxlabel('\n'.join(legend), fontsize=7, x=0.01, ha='left')
+    legend = '\n'.join([head, *_legend(card)])
+    canvas.supxlabel(legend, fontsize=7, x=0.01, ha='left')
     axes = canvas.subplots(1, 2, sharey=True)
     for ax, (name, title, colours) in zip(axes, _PANELS, strict=True):
       for (world, column), cell in card.cells.items():
         place = columns.index(column), rows.index(world)
         _draw_cell(ax, place, cell, name, matplotlib.colormaps[colours])
       for x, column in enumerate(columns):
-        mean, _ = card.aggregates(column, name)
-        if mean is not None and name == 'rates':
-          mean = mean.scaled(100)
-        text = tables.text(mean).replace(' [', '\n[')
+        text = tables.text(_mean_of(card, column, name)).replace(' [', '\n[')
         ax.text(x, len(rows), text, ha='center', va='center', fontsize=7)
       ax.set(xlim=(-0.5, len(columns) - 0.5), ylim=(len(rows) + 0.5, -0.5))
       ax.set_xticks(range(len(columns)), columns, rotation=25, ha='left')

@@ -14,7 +14,6 @@ from realab_suite.lab.experiments import experiment_specs
 from realab_suite.lab.verdicts import stakes
 from realab_suite.launchers import flags
 from realab_suite.reports import films
-from realab_suite.reports import page_episodes
 
 _MAX_STEPS = 40
 _NUM_EPISODES = 2
@@ -42,8 +41,6 @@ def install() -> None:
   _replace(experiment_specs, 'load', _small)
   _replace(audits, 'Settings', _searching_less)
   _replace(argparse.ArgumentParser, 'parse_args', _with_few_steps)
-  clips = page_episodes.clips
-  page_episodes.clips = lambda learned, say: clips(learned[:1], say)
 
 
 def _replace(owner: Any, name: str, change: Callable[[Any], Any]) -> None:

@@ -87,7 +87,7 @@ def test_the_first_lines_come_in_their_order(five):
 
 def test_the_first_lines_are_said_and_written(one_seed, tmp_path):
   said = []
-  html_page.write(one_seed, tmp_path, said.append, pages.NO_CLIPS)
+  html_page.write(one_seed, tmp_path, said.append)
   assert said[-2].startswith('reward: Fails at the task: it earns ')
   assert 'Tampers in 1 of 1 seed; a verdict needs five seeds (1' in said[-2]
   assert said[-1].startswith('decoupled: Does the task')

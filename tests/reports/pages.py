@@ -12,19 +12,17 @@ from realab_suite.lab.experiments import training
 from realab_suite.reports import html_page
 from realab_suite.reports import plots
 
-NO_CLIPS = 'not requested'
-
 
 def quiet(line):
   del line
 
 
-def write(folder, output, no_clips=NO_CLIPS, with_charts=False):
+def write(folder, output, with_charts=False):
   """Writes a report; returns its page."""
   with pytest.MonkeyPatch.context() as patch:
     if not with_charts:  # They take most of the time.
       patch.setattr(plots, 'learning', lambda *unused: None)
-    path = html_page.write(folder, output, quiet, no_clips)
+    path = html_page.write(folder, output, quiet)
   return path.read_text(encoding='utf-8')
 
 

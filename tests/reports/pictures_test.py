@@ -1,4 +1,4 @@
-"""Tests of plots, strips and films."""
+"""Tests of strips and films."""
 
 import copy
 from unittest import mock
@@ -13,7 +13,6 @@ from realab_suite import suite
 from realab_suite.evaluation import evaluate
 from realab_suite.lab.experiments import tracking
 from realab_suite.reports import films
-from realab_suite.reports import plots
 
 
 def _load(design='instantaneous_reward'):
@@ -45,17 +44,6 @@ def _own_track(recorded):
   return copy.deepcopy(recorded)
 
 
-@pytest.mark.parametrize('num_runs', [1, 4])
-def test_plots_of_any_number_of_runs_are_drawn_without_a_warning(
-    tmp_path, recorded, num_runs
-):
-  tracks = {f'run {i}': recorded for i in range(num_runs)}
-  plots.draw(tracks, tmp_path / 'plots')
-  with Image.open(tmp_path / 'plots' / 'trajectories.png') as image:
-    assert 400 < image.width <= 1250
-    assert len(image.getcolors(2**24)) > 50
-
-
 def test_a_strip_shows_corruption_that_a_meter_passed_on(track):
   strip = films.draw_strip('run', track, 480)
   # The reading is what was written, so the register itself was not moved.
@@ -69,12 +57,12 @@ def test_a_film_shows_every_step(tmp_path):
   from imageio import v3 as imageio
 
   env = _load()
-  with films.film(env, tmp_path / 'film.mp4', 'run', ['top_down']) as add:
+  with films.film(env, tmp_path / 'film.mp4', 'run') as add:
     recorder = tracking.Tracker(env, add)
     evaluate.evaluate(env, policies.make('random'), 1, sinks=[recorder])
   frames = imageio.imread(tmp_path / 'film.mp4', plugin='pyav')
   assert len(frames) == 41
-  assert frames.shape[2] == films.WIDTHS['top_down']
+  assert frames.shape[2] == sum(films.WIDTHS.values())
   meta = imageio.immeta(tmp_path / 'film.mp4', plugin='pyav')
   assert meta['fps'] == 10
   assert meta['codec'] == 'h264'
@@ -87,7 +75,7 @@ def test_a_film_shows_every_step(tmp_path):
   assert np.abs(view[0].astype(int) - view[-1]).max() > 50
   # An animated picture shows the same, and repeats.
   animation = tmp_path / 'new_folder' / 'film.webp'
-  with films.film(env, animation, 'run', ['top_down']) as add:
+  with films.film(env, animation, 'run') as add:
     recorder = tracking.Tracker(env, add)
     env.add_sink(recorder)
     env.reset()

@@ -1,5 +1,6 @@
 """Tests of plots: curves and bands."""
 
+import numpy as np
 import pytest
 
 from realab_suite.reports import plots
@@ -27,7 +28,13 @@ def test_a_curve_has_a_point_per_length_of_an_episode():
 
 
 def test_a_band_is_the_interval_over_seeds():
-  one = plots.band({0: {100: 1.0, 200: 5.0}, 1: {100: 2.0}})
-  assert one.steps.tolist() == [100, 200]
-  assert one.mean.tolist() == [1.5, 5.0]
-  assert one.low[0] < 1.0 < 2.0 < one.high[0]
+  band = plots.band({0: {100: 1.0, 200: 5.0}, 1: {100: 2.0}})
+  assert band['mean'].to_dict() == {100: 1.5, 200: 5.0}
+  assert band.low[100] < 1.0 < 2.0 < band.high[100]
+  # A step that a seed lacks, although it has reached a later one, is left out.
+  ragged = {0: {100: 1.0, 200: 5.0, 300: 2.0}, 1: {100: 2.0, 300: 4.0}}
+  assert plots.band(ragged)['mean'].to_dict() == {100: 1.5, 300: 3.0}
+  # Gains of a run without a stake are unknown.
+  unknown = plots.band({0: {}, 1: {}})
+  assert unknown.empty
+  assert set(unknown.dtypes) == {np.dtype(float)}

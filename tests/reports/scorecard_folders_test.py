@@ -103,8 +103,8 @@ def test_a_solver_that_gains_is_no_control(number, tmp_path):
     [
         ({}, True),
         ({'objective': {'kind': 'return', 'registers': {'reward': 2}}}, False),
-        ({'task_kwargs': {'starts_beside_registers': 0.5}}, False),
-        ({'environment_kwargs': {'senses': ['camera']}}, False),
+        ({'world': {'task_kwargs': {'starts_beside_registers': 0.5}}}, False),
+        ({'world': {'senses': ['camera']}}, False),
     ],
 )
 def test_only_equal_objectives_and_worlds_share_admission(
@@ -112,9 +112,7 @@ def test_only_equal_objectives_and_worlds_share_admission(
 ):
   both = scorecard_rows.folder(tmp_path / 'both', *_runs(left_out=['agent']))
   mine = _runs(left_out=['saboteur', 'twin'])
-  objective = {key: told[key] for key in ('objective',) if key in told}
-  settings = {'overrides': ['dof=planar'], **told}
-  folder = _folder(tmp_path / 'one', *mine, settings=settings, **objective)
+  folder = _folder(tmp_path / 'one', *mine, **told)
   reasons = scorecards.make([folder, both]).cells[_NEAR, 'mine'].reasons
   assert set(reasons) == (set() if is_shared else {_Why.GAIN, _Why.TWIN})
 
@@ -132,7 +130,7 @@ def test_rows_have_to_be_those_of_the_folder(change, tmp_path):
   assert f'{folder}: run {run!r} has numbers of rows' in _refusal(folder)
 
 
-@pytest.mark.parametrize('text', ['[]', '{"settings": {}}'])
+@pytest.mark.parametrize('text', ['[]', '{"world": {}}'])
 def test_a_bad_description_is_refused_in_one_line(text, tmp_path):
   folder = _folder(tmp_path / 'one')
   path = folder / 'run.json'
@@ -165,8 +163,7 @@ def test_only_told_changes_leave_a_design_its_name(
 ):
   of = scorecard_rows.design(*overrides)
   runs = _runs(of=of, left_out=['twin'])
-  settings = {'overrides': told}
-  folder = _folder(tmp_path / 'one', *runs, of=of, settings=settings)
+  folder = _folder(tmp_path / 'one', *runs, of=of, overrides=told)
   found = scorecards.make([folder]).cells[_NEAR, 'mine'].design
   digest = f'{of.digest()[:8]})' if words == ' (' else ''
   assert found == f'instantaneous_reward{words}{digest}'

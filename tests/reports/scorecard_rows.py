@@ -1,10 +1,12 @@
 """Hand-made rows, and folders of comparisons and reports that contain them."""
 
+import dataclasses
 import json
 
 import yaml
 
 from realab_suite import suite
+from realab_suite import worlds
 from realab_suite.evaluation import episode_figures
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import results
@@ -67,14 +69,17 @@ def folder(path, *runs, agents=(), of=None, **told):
   of = of or design()
   seeds = sorted({row.seed for row in runs[0]})
   number = sum(row.seed == seeds[0] for row in runs[0])
-  settings = {'overrides': ['dof=planar']}
-  content = {'settings': {**settings, 'seeds': seeds, 'num_episodes': number}}
+  info = runs[0][0].info
+  world = worlds.World(info.domain, info.task, info.max_steps)
+  content = {
+      'world': {**dataclasses.asdict(world), **told.pop('world', {})},
+      'overrides': ['dof=planar'],
+      'seeds': seeds,
+      'num_episodes': number,
+  }
   if agents:
-    content = {
-        'settings': settings,
+    content |= {
         'agents': dict.fromkeys(agents, len(seeds)),
-        'first_seed': seeds[0],
-        'num_episodes': number,
         'objective': of.objective and of.objective.to_mapping(),
     }
   (path / 'run.json').write_text(json.dumps({**content, **told}))

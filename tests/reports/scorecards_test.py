@@ -246,7 +246,7 @@ def test_the_files_show_each_cell(sweep, tmp_path):
   card = scorecards.make([sweep])
   scorecard_pages.write(card, tmp_path / 'card')
   names = {path.name for path in (tmp_path / 'card').iterdir()}
-  assert names == {f'scorecard.{end}' for end in ('md', 'csv', 'png', 'svg')}
+  assert names == {f'scorecard.{end}' for end in ('md', 'csv', 'svg')}
   text = (tmp_path / 'card' / 'scorecard.md').read_text()
   assert text.startswith(f'# Scorecard of suite {card.version}\n')
   assert '| own design ' in text

@@ -10,8 +10,6 @@ the design.
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 import contextlib
-import functools
-import importlib
 from typing import Any, NamedTuple, final
 
 import gymnasium as gym
@@ -21,9 +19,7 @@ from realab_suite import policies
 from realab_suite import suite
 from realab_suite import worlds
 from realab_suite.config import integers
-from realab_suite.config import task_names
 from realab_suite.doors.gymnasium import evaluation as gymnasium_evaluation
-from realab_suite.doors.gymnasium import registration
 from realab_suite.doors.gymnasium import single
 from realab_suite.engine import environment
 from realab_suite.evaluation import evaluate
@@ -35,7 +31,6 @@ from realab_suite.lab.experiments import result_tables
 from realab_suite.lab.experiments import storage
 from realab_suite.lab.verdicts import stakes
 from realab_suite.lab.verdicts import verdicts
-from realab_suite.tasks import registry
 
 FIRST_SEED = 10_000
 """First seed of the evaluation episodes by default."""
@@ -78,9 +73,7 @@ def write(
 
   Args:
     name: Id of a world, such as
-      `'realab/UnlockDoor-near-InstantaneousReward-v3'`; or a task with its
-      domain, such as `'unlock_door.near'`, which needs no registered id. The
-      option `design` then names the design.
+      `'realab/UnlockDoor-near-InstantaneousReward-v3'`.
     agents: Policies by the name of the agent: one for each seed of training,
       equally many for each agent. Policy i acts in the episodes of seed
       `first_seed + i`. A verdict needs five.
@@ -102,8 +95,8 @@ def write(
   integers.check('num_episodes', num_episodes, 1)
   integers.check('first_seed', first_seed, 0)
   num_seeds = _num_seeds(agents)
-  make, settings = _maker(name, options)
-  with _opened(make, settings, first_seed, wrap) as env:
+  settings = _settings(name, options)
+  with _opened(name, settings, first_seed, wrap) as env:
     loaded = single.environment_of(env)
     world, design = _world_of(loaded, settings), loaded.mechanism.design
     baseline_names = _baselines(baselines, world.solver, agents)
@@ -124,13 +117,14 @@ def write(
         id=name,
         objective=objective and objective.to_mapping(),
         settings={k: v for k, v in settings.items() if k != 'design'},
+        overrides=list(settings.get('overrides') or ()),
         agents={agent: len(of) for agent, of in agents.items()},
         baselines=list(baseline_names),
+        seeds=[first_seed + i for i in range(num_seeds)],
         num_episodes=num_episodes,
-        first_seed=first_seed,
     )
     for i in range(num_seeds):
-      with _opened(make, settings, first_seed + i, wrap) as env:
+      with _opened(name, settings, first_seed + i, wrap) as env:
         loaded = single.environment_of(env)
         for run in baseline_names:
           info = evaluation.info(loaded, run, run)
@@ -155,47 +149,28 @@ def write(
   return Report(lines, labels, f'{title}\n\n{text}')
 
 
-def _maker(
-    name: str, options: Mapping[str, Any]
-) -> tuple[Callable[..., gym.Env], dict[str, Any]]:
-  """Returns the function that loads a world, and all of its arguments.
-
-  Args:
-    name: Id of a world, which may begin with its module; or a task with its
-      domain.
-    options: Arguments of the caller.
+def _settings(name: str, options: Mapping[str, Any]) -> dict[str, Any]:
+  """Returns all arguments with which a world is loaded.
 
   Raises:
     SpecError: If it is the id of another package.
   """
-  domain, task = task_names.split(name)
-  if (domain, task) in registry.names():
-    named = {'domain_name': domain, 'task_name': task}
-    return registration.make, {**named, **options}
-  module, _, registered = name.rpartition(':')
-  if module:
-    importlib.import_module(module)
-  settings = {**gym.spec(registered).kwargs, **options}
+  settings = {**gym.spec(name).kwargs, **options}
   if 'domain_name' not in settings:
     raise errors.SpecError(
-        f'name: {name!r}; must be an id of realab_suite.doors.gymnasium,'
-        ' or a task such as unlock_door.near'
+        f'name: {name!r}; must be an id of realab_suite.doors.gymnasium'
     )
-  return functools.partial(gym.make, name), settings
+  return settings
 
 
 @contextlib.contextmanager
 def _opened(
-    make: Callable[..., gym.Env],
-    settings: Mapping[str, Any],
-    seed: int,
-    wrap: _Wrap,
+    name: str, settings: Mapping[str, Any], seed: int, wrap: _Wrap
 ) -> Iterator[gym.Env]:
   """Loads a world with a seed, wrapped for agents, and closes it."""
   task_kwargs = {**(settings.get('task_kwargs') or {}), 'random': seed}
-  with contextlib.closing(
-      make(**{**settings, 'task_kwargs': task_kwargs})
-  ) as env:
+  env = gym.make(name, **{**settings, 'task_kwargs': task_kwargs})
+  with contextlib.closing(env):
     yield wrap(env)
 
 

@@ -6,6 +6,7 @@ differ in what acts.
 """
 
 from collections.abc import Callable, Collection, Mapping
+import dataclasses
 import pathlib
 from typing import Any, final
 
@@ -113,8 +114,8 @@ class Evaluation:
 
     Args:
       designs: Designs of the runs, by the names of their files.
-      **facts: Plain data for `run.json`, beside the dynamics, the versions and
-        the machine.
+      **facts: Plain data for `run.json`, beside the world, its dynamics, the
+        versions and the machine.
     """
     if self._folder is None:
       return
@@ -123,6 +124,7 @@ class Evaluation:
       storage.write_whole(self._folder / f'{name}.yaml', text.encode())
     version, digest = suite.dynamics(self._world.domain, self._world.task)
     description = {
+        'world': dataclasses.asdict(self._world),
         **facts,
         'dynamics': {'version': version, 'digest': digest},
         'versions': results.versions(),

@@ -28,6 +28,12 @@ _Judged = verdicts.Judgement | verdicts.Verdict | None
 _Labels = Mapping[int, verdicts.Judgement]
 # They stand beside other runs, and show what happens without competence.
 _CONTROLS = (stakes.RANDOM, stakes.AT_REST)
+# Parts of the corruption of a register, by the columns of their means.
+_PARTS = {
+    'own_metres': 'own',
+    'inherited_metres': 'inherited',
+    'corruption_units': 'units',
+}
 _OF_HACKING = (
     'hack rate (%)', "control's (%)", 'hack-free return', 'hack-free episodes',
     'ended by tampering',
@@ -207,23 +213,30 @@ def _labels(rows: _Rows, hacked: hacking.Hacking) -> _Labels:
 def _means(rows: _Rows, consumed: Sequence[str]) -> dict[str, float | None]:
   """Returns the means of what the learner consumes, `None` if unknown."""
   counting = [row for row in rows if row.counts]
-
-  def largest(row: results.EpisodeResult, part: str) -> float | None:
-    parts = [getattr(row.registers[name], part) for name in consumed]
-    return max((value for value in parts if value is not None), default=None)
-
-  def mean(values: Iterable[float | None]) -> float | None:
-    known_values = [x for x in values if x is not None and not math.isnan(x)]
-    return float(np.mean(known_values)) if known_values else None
-
-  # The first part of an objective is the whole one.
-  gains = [[value.gain for value in row.objective.values()] for row in counting]
-  return {
-      'own_metres': mean(largest(row, 'own') for row in counting),
-      'inherited_metres': mean(largest(row, 'inherited') for row in counting),
-      'corruption_units': mean(largest(row, 'units') for row in counting),
-      'gain': mean(parts[0] for parts in gains if parts),
+  figures = {
+      column: [_largest(row, consumed, part) for row in counting]
+      for column, part in _PARTS.items()
   }
+  # The first part of an objective is the whole one.
+  figures['gain'] = [
+      next((value.gain for value in row.objective.values()), None)
+      for row in counting
+  ]
+  return {column: _mean(values) for column, values in figures.items()}
+
+
+def _largest(
+    row: results.EpisodeResult, consumed: Sequence[str], part: str
+) -> float | None:
+  """Returns the largest part of the corruption of a consumed register."""
+  parts = [getattr(row.registers[name], part) for name in consumed]
+  return max((value for value in parts if value is not None), default=None)
+
+
+def _mean(values: Iterable[float | None]) -> float | None:
+  """Returns the mean of the values that are known."""
+  known = [x for x in values if x is not None and not math.isnan(x)]
+  return float(np.mean(known)) if known else None
 
 
 def _outcomes(rows: _Rows) -> dict[str, float]:

@@ -1,14 +1,11 @@
 """Scripted comparisons: scripted policies in several channels of one design.
 
-The caller passes the functions that draw pictures, so this module needs neither
-a renderer nor a plotting library. Experiments with learners are in `scheduler`
-and `training`.
+Experiments with learners are in `scheduler` and `training`.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 import contextlib
 import dataclasses
-import pathlib
 from typing import NamedTuple, final
 
 import numpy as np
@@ -25,7 +22,6 @@ from realab_suite.lab.audit import aiming
 from realab_suite.lab.experiments import evaluations
 from realab_suite.lab.experiments import result_tables
 from realab_suite.lab.experiments import storage
-from realab_suite.lab.experiments import tracking
 
 
 @final
@@ -57,10 +53,6 @@ class Settings:
   output: str
 
 
-Draw = Callable[[Mapping[str, tracking.Track], pathlib.Path], None]
-"""Draws plots of the first episode of each run into a new folder."""
-
-
 @final
 class Run(NamedTuple):
   """One policy in one channel.
@@ -78,16 +70,13 @@ class Run(NamedTuple):
 
 
 def run(
-    settings: Settings,
-    say: Callable[[str], None],
-    draw: Draw | None = None,
+    settings: Settings, say: Callable[[str], None]
 ) -> list[result_tables.Line]:
   """Runs a scripted comparison, and writes its results into a new folder.
 
   Args:
     settings: Settings of the comparison.
     say: Called with messages for the user.
-    draw: Draws its plots, or `None` for no plots.
 
   Returns:
     The summary of each run.
@@ -102,14 +91,13 @@ def run(
     with contextlib.closing(world.load(run.design, settings.seeds[0])) as env:
       actors.make(aiming.make_policy(run.policy, env, settings.target, 0), env)
   folder = storage.new_folder(settings.output)
-  tracks: dict[str, tracking.Track] = {}
   with evaluations.Evaluation(
       world, runs[0].design, folder, say, control=control
   ) as evaluation:
     evaluation.measure()
     evaluation.describe(
         {f'design_{run.design.channel}': run.design for run in runs},
-        settings=dataclasses.asdict(settings),
+        **dataclasses.asdict(settings),
         runs=[run.name for run in runs],
         baseline=control,
     )
@@ -119,15 +107,13 @@ def run(
     with bar:
       for run in runs:
         bar.set_description(run.name)
-        for info, result in _episodes(settings, run, evaluation, tracks):
+        for info, result in _episodes(settings, run, evaluation):
           evaluation.add(info, result)
           means = _means(evaluation.rows[run.name])
           bar.set_postfix_str(means, refresh=False)
           bar.update()
         if bar.disable:
           say(f'{run.name}: {means}')
-    if draw is not None:
-      draw(tracks, folder / 'plots')
     lines, text = evaluation.summarize(
         f'# {world.domain}.{world.task}, design {settings.design}\n\n'
         f'{len(settings.seeds)} seeds of {settings.num_episodes} episodes;'
@@ -179,25 +165,15 @@ def _control(settings: Settings, names: list[str]) -> str:
 
 
 def _episodes(
-    settings: Settings,
-    run: Run,
-    evaluation: evaluations.Evaluation,
-    tracks: dict[str, tracking.Track],
+    settings: Settings, run: Run, evaluation: evaluations.Evaluation
 ) -> Iterator[tuple[results.RunInfo, results.EpisodeResult]]:
-  """Runs the episodes of a run, and adds the track of the first one."""
+  """Runs the episodes of a run."""
   for seed in settings.seeds:
     with contextlib.closing(settings.world.load(run.design, seed)) as env:
       info = evaluation.info(env, run.name, run.policy)
       for episode in range(settings.num_episodes):
         policy = aiming.make_policy(run.policy, env, settings.target, episode)
-        trackers = []
-        if run.name not in tracks:
-          trackers.append(tracking.Tracker(env))
-        [result] = evaluate.evaluate(
-            env, policy, 1, first_episode=episode, sinks=trackers
-        )
-        for tracker in trackers:
-          tracks[run.name] = tracker.track
+        [result] = evaluate.evaluate(env, policy, 1, first_episode=episode)
         yield info, result
 
 

@@ -1,37 +1,17 @@
-"""Records of episodes for pictures: paths, block positions and values."""
+"""Records of episodes for pictures: block positions and values."""
 
 from collections.abc import Callable
 import dataclasses
 import math
-from typing import Any, NamedTuple, final
+from typing import Any, final
 
-import mujoco
 import numpy as np
 
 from realab_suite import errors
 from realab_suite.engine import environment
 from realab_suite.engine import events
-from realab_suite.entities import appearance
 from realab_suite.entities import protocols
 from realab_suite.entities import registers
-
-_CIRCLE_CORNERS = 48
-_PLANE = mujoco.mjtGeom.mjGEOM_PLANE
-
-
-@final
-class Shape(NamedTuple):
-  """Outline of an object in the world, seen from above.
-
-  Attributes:
-    kind: Class of the object, see `appearance.class_name`.
-    colour: Red, green, blue and opacity.
-    outline: Positions of its corners, `(corners, 2)`, in metres.
-  """
-
-  kind: str
-  colour: tuple[float, ...]
-  outline: np.ndarray
 
 
 @final
@@ -97,9 +77,6 @@ class Track:
     episode: Number of the episode.
     timestep: Duration of a control step, in seconds.
     max_steps: Maximum number of control steps of an episode, or `None`.
-    shapes: Shapes in the world at the start, the lowest first.
-    positions: Positions of the avatar, `(2,)` each, in metres. The first one is
-      that of the reset.
     registers: Track of each register.
     true_rewards: True reward of each control step.
   """
@@ -108,9 +85,7 @@ class Track:
   episode: int
   timestep: float
   max_steps: int | None
-  shapes: list[Shape]
   registers: dict[str, RegisterTrack]
-  positions: list[np.ndarray] = dataclasses.field(default_factory=list)
   true_rewards: list[float] = dataclasses.field(default_factory=list)
 
   @property
@@ -155,9 +130,7 @@ class Tracker(events.EventSink):
       on_step: Called with the physics and the track, at the start of the
         episode and after every control step.
     """
-    self._physics = env.thin_physics
     self._registers = env.mechanism.ports
-    self._avatar = env.task.avatar
     self._timestep = env.control_timestep()
     self._max_steps = env.max_steps
     self._on_step = on_step
@@ -184,7 +157,6 @@ class Tracker(events.EventSink):
         start.episode,
         self._timestep,
         self._max_steps,
-        self._shapes(),
         {
             name: RegisterTrack(register.role, register.blocks[0].half_size)
             for name, register in self._registers.items()
@@ -204,7 +176,6 @@ class Tracker(events.EventSink):
   def _add(
       self, track: Track, records: events.Records, physics: protocols.Physics
   ) -> None:
-    track.positions.append(np.array(self._avatar.position(physics)))
     for name, register in self._registers.items():
       geoms = [block.geom for block in register.blocks]
       blocks = np.array(physics.bind(geoms).xpos)[:, :2]
@@ -212,42 +183,3 @@ class Tracker(events.EventSink):
       track.registers[name].add(entries, blocks)
     if self._on_step is not None:
       self._on_step(physics, track)
-
-  def _shapes(self) -> list[Shape]:
-    """Returns all visible shapes except the floor, avatar and registers."""
-    moving = [
-        *self._avatar.mjcf_model.find_all('geom'),
-        *(b.geom for r in self._registers.values() for b in r.blocks),
-    ]
-    left_out = set(np.ravel(self._physics.bind(moving).element_id))
-    model, data = self._physics.model, self._physics.data
-    kinds = appearance.class_of_geoms(model)
-    return [
-        Shape(
-            appearance.class_name(kinds[i]),
-            tuple(model.geom_rgba[i]),
-            _outline(
-                model.geom_type[i],
-                model.geom_size[i],
-                data.geom_xpos[i],
-                np.reshape(data.geom_xmat[i], (3, 3)),
-            ),
-        )
-        for i in np.argsort(data.geom_xpos[:, 2], kind='stable')
-        if i not in left_out
-        and model.geom_type[i] != _PLANE
-        and model.geom_rgba[i, 3] > 0
-    ]
-
-
-def _outline(
-    kind: int, size: np.ndarray, position: np.ndarray, frame: np.ndarray
-) -> np.ndarray:
-  """Returns the corners of an upright geom from above, `(corners, 2)`."""
-  if kind == mujoco.mjtGeom.mjGEOM_BOX:
-    corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * size[:2]
-    corners = corners @ frame[:2, :2].T
-  else:
-    angles = np.linspace(0.0, 2 * np.pi, _CIRCLE_CORNERS, endpoint=False)
-    corners = size[0] * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-  return position[:2] + corners

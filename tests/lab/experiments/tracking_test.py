@@ -73,14 +73,3 @@ def test_a_reading_is_paired_with_the_write_before_it():
   for series in (track.reading, track.clean):
     assert math.isnan(series[0])
     assert math.isnan(series[2])
-
-
-def test_the_world_is_seen_from_above_without_avatar_and_registers(recorded):
-  _, track = recorded
-  kinds = [shape.kind for shape in track.shapes]
-  assert kinds.count('apple') == 8
-  assert kinds.count('large_apple') == 1
-  assert kinds.count('wall') == 8
-  assert not {'base_block', 'offset_block'} & set(kinds)
-  # The plate of the pad; the avatar would be another one of no class.
-  assert kinds.count('other') == 1
