@@ -1,7 +1,7 @@
 """Spaces of Gymnasium for specs of dm_env, and conversion of their values."""
 
 from collections.abc import Mapping
-from typing import Any, Literal, final
+from typing import Any, final
 
 from dm_env import specs
 from gymnasium import spaces
@@ -15,7 +15,6 @@ from realab_suite.entities import appearance
 _LARGEST = float(np.finfo(np.float32).max)
 
 Observation = dict[str, np.ndarray] | np.ndarray
-DType = Literal['float32', 'float64']
 
 
 def key_of(name: str) -> str:
@@ -41,24 +40,18 @@ class ObservationCodec:
   """
 
   def __init__(
-      self,
-      observation_spec: Mapping[str, specs.Array],
-      dtype: DType = 'float32',
-      flat: bool = False,
+      self, observation_spec: Mapping[str, specs.Array], flat: bool = False
   ) -> None:
     """Initializes the codec.
 
     Args:
       observation_spec: Observation spec of one world.
-      dtype: Type of the floats.
       flat: True for flat observations.
     """
-    self._dtype = np.dtype(dtype)
     self._flat = flat
     self._names = {key_of(name): name for name in sorted(observation_spec)}
     self._parts = {
-        key: _part(observation_spec[name], self._dtype)
-        for key, name in self._names.items()
+        key: _part(observation_spec[name]) for key, name in self._names.items()
     }
     self._lows = {
         key: int(np.min(observation_spec[name].minimum))
@@ -67,7 +60,9 @@ class ObservationCodec:
     }
     self.space: spaces.Space[Any] = spaces.Dict(self._parts)
     if flat:
-      self.space = _flat_space(self._parts, self._dtype)
+      box: Any = spaces.flatten_space(self.space)
+      low, high = (bound.astype(np.float32) for bound in (box.low, box.high))
+      self.space = spaces.Box(low, high)
 
   def encode(
       self, observation: Mapping[str, np.ndarray], lead: tuple[int, ...] = ()
@@ -88,7 +83,7 @@ class ObservationCodec:
         self._vector(key, value).reshape(*lead, -1)
         for key, value in encoded.items()
     ]
-    return np.concatenate(vectors, axis=-1).astype(self._dtype, copy=False)
+    return np.concatenate(vectors, axis=-1).astype(np.float32, copy=False)
 
   def _encode(
       self, key: str, value: np.ndarray, lead: tuple[int, ...]
@@ -103,11 +98,11 @@ class ObservationCodec:
     if not isinstance(part, spaces.MultiDiscrete):
       return value
     num_classes = int(part.nvec.flat[0])
-    one_hot: np.ndarray = np.eye(num_classes, dtype=self._dtype)[value]
+    one_hot: np.ndarray = np.eye(num_classes, dtype=np.float32)[value]
     return one_hot
 
 
-def _part(spec: specs.Array, dtype: np.dtype) -> spaces.Space[Any]:
+def _part(spec: specs.Array) -> spaces.Space[Any]:
   """Returns the space of one entry of an observation."""
   kind = np.dtype(spec.dtype).kind
   shape = spec.shape or (1,)
@@ -123,19 +118,10 @@ def _part(spec: specs.Array, dtype: np.dtype) -> spaces.Space[Any]:
       # the numbers of classes, as in Stable-Baselines3, do not overflow.
       return spaces.MultiDiscrete(np.full(shape, num_classes), dtype=np.int16)
   low, high = (
-      np.broadcast_to(np.clip(one, -_LARGEST, _LARGEST), shape).astype(dtype)
+      np.broadcast_to(np.clip(one, -_LARGEST, _LARGEST), shape)
       for one in (low, high)
   )
-  return spaces.Box(low, high, shape, dtype.type)
-
-
-def _flat_space(
-    parts: Mapping[str, spaces.Space[Any]], dtype: np.dtype
-) -> spaces.Box:
-  flat: Any = spaces.flatten_space(spaces.Dict(dict(parts)))
-  return spaces.Box(
-      flat.low.astype(dtype), flat.high.astype(dtype), dtype=dtype.type
-  )
+  return spaces.Box(low.astype(np.float32), high.astype(np.float32), shape)
 
 
 @final
@@ -146,30 +132,26 @@ class ActionCodec:
   of indices (queries and the action), and `Box` otherwise.
   """
 
-  def __init__(
-      self, action_spec: specs.Array, dtype: DType = 'float32'
-  ) -> None:
+  def __init__(self, action_spec: specs.Array) -> None:
     """Initializes the codec.
 
     Args:
       action_spec: Action spec of one world.
-      dtype: Type of the floats.
     """
-    kind = np.dtype(dtype)
     self._spec = action_spec
     self.space: spaces.Space[Any]
     if isinstance(action_spec, specs.DiscreteArray):
       self.space = spaces.Discrete(action_spec.num_values)
     elif np.dtype(action_spec.dtype).kind in 'iu':
-      low = np.asarray(action_spec.minimum, np.int64)
-      number = np.asarray(action_spec.maximum, np.int64) - low + 1
-      self.space = spaces.MultiDiscrete(number, start=low)
+      start = np.asarray(action_spec.minimum, np.int64)
+      number = np.asarray(action_spec.maximum, np.int64) - start + 1
+      self.space = spaces.MultiDiscrete(number, start=start)
     else:
       low, high = (
-          np.broadcast_to(one, action_spec.shape).astype(kind)
+          np.broadcast_to(one, action_spec.shape).astype(np.float32)
           for one in (action_spec.minimum, action_spec.maximum)
       )
-      self.space = spaces.Box(low, high, dtype=kind.type)
+      self.space = spaces.Box(low, high)
 
   def decode(self, action: Any) -> Any:
     """Returns actions of `space` as actions of the environment.
@@ -196,7 +178,7 @@ class ActionCodec:
 
 
 def reward_key(
-    reward_register: Any, observation_spec: Mapping[str, specs.Array]
+    reward_register: str | None, observation_spec: Mapping[str, specs.Array]
 ) -> str | None:
   """Returns the entry of the observation that is the reward, or `None`.
 
@@ -215,7 +197,7 @@ def reward_key(
       for name in observation_spec
       if name.startswith(prefix)
   ]
-  if not isinstance(reward_register, str) or reward_register not in readable:
+  if reward_register not in readable:
     raise errors.SpecError(
         f'reward_register: {messages.quote(reward_register)}; must be None'
         f' or one of the registers that the agent reads: {readable}'

@@ -1,12 +1,11 @@
 """Evaluation of policies that act through the interface of Gymnasium."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
 
 from realab_suite.doors.gymnasium import single
-from realab_suite.engine import events
 from realab_suite.evaluation import evaluate as evaluation
 from realab_suite.evaluation import results
 from realab_suite.feedback import objectives
@@ -20,9 +19,6 @@ def evaluate(
     policy: Policy,
     num_episodes: int,
     *,
-    first_episode: int = 0,
-    sinks: Sequence[events.EventSink] = (),
-    on_episode: Callable[[results.EpisodeResult], None] | None = None,
     objective: objectives.ObjectiveSpec | None = None,
 ) -> list[results.EpisodeResult]:
   """Runs a policy for a number of episodes, and returns the hidden figures.
@@ -36,10 +32,6 @@ def evaluate(
       policy was trained with.
     policy: Function from an observation of `env` to an action.
     num_episodes: Number of episodes to run.
-    first_episode: Number of the first episode.
-    sinks: Additional event sinks.
-    on_episode: Function that is called with the result of each episode when it
-      ends.
     objective: Objective in place of that of the design, or `None`.
 
   Returns:
@@ -59,11 +51,5 @@ def evaluate(
     environment.abandon()  # If a wrapper has ended the episode.
 
   return evaluation.results_of(
-      environment,
-      play,
-      num_episodes,
-      first_episode=first_episode,
-      sinks=sinks,
-      on_episode=on_episode,
-      objective=objective,
+      environment, play, num_episodes, objective=objective
   )

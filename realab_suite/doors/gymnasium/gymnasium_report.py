@@ -30,7 +30,6 @@ from realab_suite.lab.experiments import evaluations
 from realab_suite.lab.experiments import result_tables
 from realab_suite.lab.experiments import storage
 from realab_suite.lab.verdicts import stakes
-from realab_suite.lab.verdicts import verdicts
 
 FIRST_SEED = 10_000
 """First seed of the evaluation episodes by default."""
@@ -43,13 +42,11 @@ class Report(NamedTuple):
   """A report.
 
   Attributes:
-    lines: Summary of each run, the control first.
-    labels: Label of each seed, by the name of the agent.
+    lines: Summary of each run, the control first, with the labels of an agent.
     text: Contents of `summary.md`.
   """
 
   lines: list[result_tables.Line]
-  labels: dict[str, Mapping[int, verdicts.Judgement]]
   text: str
 
 
@@ -145,8 +142,7 @@ def write(
         ' means with 95 % intervals.'
     )
     lines, text = evaluation.summarize(title, agents)
-  labels = {line.run: line.labels for line in lines if line.run in agents}
-  return Report(lines, labels, f'{title}\n\n{text}')
+  return Report(lines, f'{title}\n\n{text}')
 
 
 def _settings(name: str, options: Mapping[str, Any]) -> dict[str, Any]:
@@ -234,21 +230,18 @@ def _baselines(
     agents: Names of the agents.
 
   Raises:
-    SpecError: If there is none, one is there twice, the solver is missing, or
-      an agent has the name of a baseline.
+    SpecError: If they are not valid, or an agent has the name of one.
   """
   if names is None:
     names = [stakes.RANDOM] if solver is None else [solver, stakes.RANDOM]
-  if not names:
-    raise errors.SpecError('baselines: []; at least one is needed')
   if policies.base.SOLVER in names and solver is None:
     raise errors.SpecError(
-        'baselines: solver: the task names no solver; name other' ' policies'
+        'baselines: solver: the task names no solver; name other policies'
     )
   names = [solver or n if n == policies.base.SOLVER else n for n in names]
-  if len({*names}) != len(names):
+  if not names or len({*names}) != len(names):
     raise errors.SpecError(
-        f'baselines: {names}; each policy must be given once'
+        f'baselines: {names}; must be at least one policy, each of them once'
     )
   # Tables do not judge runs with the names of controls.
   for name in (*names, stakes.RANDOM, stakes.AT_REST):

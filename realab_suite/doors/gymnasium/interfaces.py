@@ -9,9 +9,10 @@ from realab_suite import errors
 from realab_suite.config import validation
 from realab_suite.doors.gymnasium import codecs
 from realab_suite.engine import agent_view
-from realab_suite.engine import arguments
 
-_DEFAULT = 'top_down'
+_CAMERA = 'top_down'
+# Height and width of a frame, in pixels.
+_SIZE = (240, 320)
 # MuJoCo's free camera.
 _FREE = -1
 
@@ -23,24 +24,14 @@ class Options(validation.Model):
   Attributes:
     reward_register: Name of the register whose reading is the reward, or `None`
       for a reward of 0.0.
-    dtype: Type of floats in observations and actions.
     flat: True for observations that are one vector for each world.
     render_mode: `'rgb_array'`, or `None`. Frames are for people.
-    camera_name: Camera of the frames; `None` for `'top_down'`, or a free camera
-      in a single world without it.
-    height: Height of a frame, in pixels.
-    width: Width of a frame, in pixels.
   """
 
-  # `codecs.reward_key` knows which registers there are.
-  reward_register: Any = None
-  dtype: codecs.DType = 'float32'
+  reward_register: str | None = None
   flat: bool = False
   # Not `| None`, which the error message would leave out.
   render_mode: Literal['rgb_array', None] = None
-  camera_name: str | None = None
-  height: int = 240
-  width: int = 320
 
 
 def check_names(given: Collection[str], allowed: Collection[str]) -> None:
@@ -91,21 +82,16 @@ class Interface:
     Raises:
       SpecError: If an option is invalid.
     """
-    check_names(options, Options.model_fields)
     values = validation.validate(Options, options, 'options')
     spec = view.observation_spec()
     self.reward_key = codecs.reward_key(values.reward_register, spec)
-    self.observations = codecs.ObservationCodec(spec, values.dtype, values.flat)
-    self.actions = codecs.ActionCodec(view.action_spec(), values.dtype)
+    self.observations = codecs.ObservationCodec(spec, values.flat)
+    self.actions = codecs.ActionCodec(view.action_spec())
     self.metadata = {
         'render_modes': ['rgb_array'],
         'render_fps': 1.0 / task.control_timestep,
     }
     self.render_mode = values.render_mode
     model = task.root_entity.mjcf_model
-    camera: str | int = _DEFAULT
-    if values.camera_name is not None:
-      camera = arguments.camera(values.camera_name, model)
-    elif model.find('camera', _DEFAULT) is None:
-      camera = _FREE
-    self.frame = (camera, values.height, values.width)
+    has_camera = model.find('camera', _CAMERA) is not None
+    self.frame = (_CAMERA if has_camera else _FREE, *_SIZE)

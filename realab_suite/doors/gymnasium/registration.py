@@ -7,9 +7,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from realab_suite import errors
 from realab_suite import suite
-from realab_suite.config import messages
 from realab_suite.doors.gymnasium import interfaces
 from realab_suite.doors.gymnasium import single
 from realab_suite.doors.gymnasium import vector
@@ -17,9 +15,6 @@ from realab_suite.feedback import specs
 
 NAMESPACE = 'realab'
 """Namespace of the ids."""
-
-# Options of batches alone.
-_OF_BATCHES = ('num_envs', 'num_threads', 'sleep', 'autoreset_mode')
 
 
 def make(
@@ -43,12 +38,6 @@ def make(
   Raises:
     SpecError: If an argument is invalid.
   """
-  for name in _OF_BATCHES:
-    if name in options:
-      raise errors.SpecError(
-          f'{name}: {messages.quote(options[name])}; allowed only in'
-          ' gymnasium.make_vec, which makes several worlds'
-      )
   load = functools.partial(suite.load, domain_name, task_name)
   return _adapted(load, single.RealabEnv, {'design': design, **options})
 
@@ -96,37 +85,41 @@ def id_of(domain_name: str, task_name: str, design: str) -> str:
   Raises:
     UnknownNameError: If there is no such task.
   """
+  domain, design = (
+      ''.join(word.capitalize() for word in name.split('_'))
+      for name in (domain_name, design)
+  )
   version = _version(domain_name, task_name)
-  words = (_camel_case(domain_name), task_name, _camel_case(design))
-  return f'{NAMESPACE}/{"-".join(words)}-v{version}'
+  return f'{NAMESPACE}/{domain}-{task_name}-{design}-v{version}'
 
 
 def ids() -> list[str]:
   """Returns the ids of all shipped worlds with all shipped designs."""
-  return [
-      id_of(*task, design)
-      for task in suite.ALL_TASKS
-      for design in suite.designs_for(task[0])
-  ]
+  return [id_of(*names) for names in _worlds()]
 
 
 def register_all() -> None:
   """Registers all ids, unless they are registered already."""
-  for domain_name, task_name in suite.ALL_TASKS:
-    for design in suite.designs_for(domain_name):
-      name = id_of(domain_name, task_name, design)
-      if name in gym.registry:
-        continue
+  for names in _worlds():
+    name = id_of(*names)
+    if name not in gym.registry:
       gym.register(
           name,
           entry_point=f'{__name__}:make',
           vector_entry_point=f'{__name__}:make_vector',
-          kwargs={
-              'domain_name': domain_name,
-              'task_name': task_name,
-              'design': design,
-          },
+          kwargs=dict(
+              zip(('domain_name', 'task_name', 'design'), names, strict=True)
+          ),
       )
+
+
+def _worlds() -> list[tuple[str, str, str]]:
+  """Returns the domain, the task and the design of every id."""
+  return [
+      (*task, design)
+      for task in suite.ALL_TASKS
+      for design in suite.designs_for(task[0])
+  ]
 
 
 def _adapted(
@@ -158,7 +151,3 @@ def _adapted(
 def _version(domain_name: str, task_name: str) -> int:
   version, _ = suite.dynamics(domain_name, task_name)
   return version
-
-
-def _camel_case(name: str) -> str:
-  return ''.join(word.capitalize() for word in name.split('_'))

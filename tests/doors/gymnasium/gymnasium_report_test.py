@@ -98,7 +98,7 @@ def test_a_report_has_rows_and_figures_of_agents_and_baselines(tmp_path):
       'apple_seeker', 'random', 'mine',
   ]  # fmt: skip
   # The solver earns nothing in four steps.
-  assert report.labels == {'mine': {}}
+  assert report.lines[-1].labels == {}
   assert report.text.count('Not judged: its stake is degenerate') == 1
   assert '\n| mine ' in report.text
   assert (folder / 'summary.md').read_text() == f'{report.text}\n'
@@ -112,7 +112,7 @@ def test_seeds_that_gain_are_labelled_and_others_stay_unclear(tmp_path):
   report, rows = _report(
       tmp_path, mover, baselines=['apple_seeker', 'random'], num_episodes=8
   )
-  [label] = report.labels['mover'].values()
+  [label] = report.lines[-1].labels.values()
   assert str(label) == 'tampers'
   assert '* mover: seed 10000: tampers' in report.text
   control, random, line = report.lines
@@ -139,7 +139,7 @@ def test_without_a_record_of_training_no_label_is_favourable(tmp_path):
       _Mover('reward', 0.0, np.zeros(6, np.float32)),
       num_episodes=30,
   )
-  [label] = report.labels['mover'].values()
+  [label] = report.lines[-1].labels.values()
   assert str(label) == 'unclear: its training was not recorded'
 
 
@@ -164,13 +164,13 @@ def test_an_agent_is_judged_on_the_register_that_paid_it(tmp_path):
   )
   assert {tuple(row.objective) for row in rows} == {('return',)}
   assert set(stakes.of(rows[0]).parts) == {'return'}
-  assert [str(one) for one in paid.labels['mover'].values()] == ['tampers']
+  assert [str(one) for one in paid.lines[-1].labels.values()] == ['tampers']
   assert paid.lines[-1].means['own_metres'] > 0.1
   other, rows = _report(
       tmp_path / 'other', mover, design=design, num_episodes=2
   )
   assert {tuple(row.objective) for row in rows} == {('mean',)}
-  assert 'tampers' not in map(str, other.labels['mover'].values())
+  assert 'tampers' not in map(str, other.lines[-1].labels.values())
   assert other.lines[-1].means['own_metres'] == 0
 
 

@@ -97,9 +97,6 @@ def test_observations_have_no_slashes_no_empty_shapes_and_classes():
   assert isinstance(classes, gym.spaces.MultiDiscrete)
   assert set(classes.nvec) == {appearance.CAPACITY}
   assert space['registers_reward'].dtype == np.float32
-  exact = _make(dtype='float64')
-  assert exact.observation_space['registers_reward'].dtype == np.float64
-  assert exact.action_space.dtype == np.float64
 
 
 def test_a_world_contains_no_class_but_those_of_its_spec():
@@ -131,14 +128,14 @@ def test_a_flat_observation_is_that_of_gymnasiums_wrapper():
 
 
 def test_the_reward_is_zero_or_the_reading_of_a_register():
-  silent, paid = _make(), _make(reward_register='reward', dtype='float64')
+  silent, paid = _make(), _make(reward_register='reward')
   for env in (silent, paid):
     env.reset(seed=1)
   for _ in range(_MAX_STEPS):
-    action = np.ones(6)
-    assert silent.step(action.astype(np.float32))[1] == 0.0
+    action = np.ones(6, np.float32)
+    assert silent.step(action)[1] == 0.0
     observation, reward, *_, info = paid.step(action)
-    assert reward == observation['registers_reward'][0]
+    assert np.float32(reward) == observation['registers_reward'][0]
     assert info == {}
 
 
@@ -155,7 +152,7 @@ def test_the_time_limit_truncates_and_the_next_step_needs_a_reset():
 
 def test_an_end_of_the_task_terminates():
   kwargs = {'random': 1}
-  env = gym.make(_NEAR, dtype='float64', task_kwargs=kwargs).unwrapped
+  env = gym.make(_NEAR, task_kwargs=kwargs).unwrapped
   other = suite.load(
       'unlock_door', 'near', kwargs, design='instantaneous_reward'
   )
@@ -184,10 +181,8 @@ def test_actions_of_another_shape_or_type_are_refused(action):
     ('options', 'message'),
     [
         ({'reward_register': 'score'}, r"must be None .*\['reward'\]"),
-        ({'dtype': 'float16'}, "must be 'float32' or 'float64'"),
         ({'render_mode': 'human'}, "must be 'rgb_array' or None"),
         ({'flat': 'yes'}, "flat: must be .*'yes'"),
-        ({'camera_name': 'nowhere'}, 'camera'),
     ],
 )
 def test_wrong_options_are_refused(options, message):
@@ -216,13 +211,6 @@ def test_a_wrong_option_is_told_all_options(option, hint):
     assert [name in allowed for name in of_batches] == [is_batch] * 3
     if hint in allowed:
       assert f'did you mean {hint!r}?' in hinted
-
-
-def test_options_of_batches_point_single_worlds_to_make_vec():
-  with pytest.raises(
-      errors.SpecError, match=r'^num_threads: .*gymnasium\.make_vec'
-  ):
-    gym.make(_NEAR, num_threads=2)
 
 
 def _public(thing: Any) -> dict[str, Any]:
@@ -340,12 +328,12 @@ def test_an_evaluation_is_that_of_the_evaluator():
   action = np.array([1.0, 0.0, 0.5, 0.0, 1.0, 0.0], np.float32)
   env = gym.make(_NEAR, task_kwargs={'random': 3}, **_SHORT)
   env = gym.wrappers.FlattenObservation(env)
-  found = evaluation.evaluate(env, lambda _: action, 2, first_episode=1)
+  found = evaluation.evaluate(env, lambda _: action, 2)
   other = suite.load(
       'unlock_door', 'near', {'random': 3}, {'max_steps': _MAX_STEPS},
       design='instantaneous_reward',
   )  # fmt: skip
-  expected = evaluate.evaluate(other, lambda _: action, 2, first_episode=1)
+  expected = evaluate.evaluate(other, lambda _: action, 2)
   assert found == expected
   assert found[0].is_valid
 

@@ -24,8 +24,6 @@ def test_gymnasium_records_films(tmp_path):
   options: Any = {
       'render_mode': 'rgb_array',
       'environment_kwargs': {'max_steps': _MAX_STEPS},
-      'height': 48,
-      'width': 64,
   }
   one, many = tmp_path / 'one', tmp_path / 'many'
   env = gym.wrappers.RecordVideo(gym.make(_NEAR, **options), str(one))
@@ -40,5 +38,5 @@ def test_gymnasium_records_films(tmp_path):
     [file] = folder.glob('*.mp4')
     film = imageio.imread(file, plugin='pyav')
     # The first frame, and one after each step; worlds are side by side.
-    assert film.shape == (_MAX_STEPS + 1, 48, 64 * num_worlds, 3)
+    assert film.shape == (_MAX_STEPS + 1, 240, 320 * num_worlds, 3)
     assert film.std() > 10
