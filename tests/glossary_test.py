@@ -32,7 +32,7 @@ def _moved(*names, step=3):
 
 _ASKED_PERSON = {
     'kind': person.KIND, 'asks': 'approval', 'reads': ['query'],
-    'writes': ['reward'], 'answers': 'live', 'waits': True,
+    'writes': ['reward'], 'waits': True,
 }  # fmt: skip
 _CHAIN = tampered.design(_NOTE, _adding(['clock'], 'note'), _adding(['note']))
 _PERSON = tampered.design(_QUERY, _ASKED_PERSON)

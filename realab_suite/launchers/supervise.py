@@ -6,7 +6,7 @@ r"""Lets a person provide the feedback of an agent, in a browser.
 The program prints the address of a page, on which the person approves actions,
 corrects them, compares two clips, or stops the episode. The output folder gets
 the answers (`answers.jsonl`), the design, and the results of the episodes. The
-source `recorded` of the provider `person` replays the answers. The agent is not
+option `recorded` of the provider `person` repeats the answers. The agent is not
 judged: a person would have to answer again for a control.
 """
 
@@ -15,6 +15,7 @@ import contextlib
 from absl import flags as absl_flags
 
 from realab_suite import errors
+from realab_suite.lab.experiments import requirements
 from realab_suite.launchers import flags
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
@@ -40,15 +41,13 @@ _WAIT = absl_flags.DEFINE_boolean(
     'Waits for every answer. Otherwise the episode continues without, and the'
     ' provider is silent.',
 )
-_EVERY = absl_flags.DEFINE_integer(
-    'every', 1, 'Control steps between two questions.', 1
-)
 
 
 def main() -> None:
   """Serves the page, and writes the answers."""
   output = flags.required(flags.OUTPUT, '; name a folder for the answers')
-  if problem := renderers.why_no_page():
+  problem = requirements.missing('websockets', 'PIL', extra='browser')
+  if problem := problem or renderers.choose_renderer():
     raise errors.ResultsError(f'cannot show the world: {problem}')
   # Imports dm_control, so a renderer has to be chosen first.
   from realab_suite.doors.browser import servers
@@ -65,9 +64,7 @@ def main() -> None:
       if flags.DESIGN.present
       else supervised_designs.design(
           _ASKS.value,
-          'live',
           waits=_WAIT.value,
-          every=_EVERY.value,
           action_set=world.action_set,
       )
   )
@@ -77,7 +74,7 @@ def main() -> None:
     stack.enter_context(contextlib.closing(env))
     name = flags.POLICY.value
     policy = aiming.make_policy(name, env, flags.TARGET.value, 0)
-    server = stack.enter_context(servers.PageServer())
+    server = stack.enter_context(contextlib.closing(servers.PageServer()))
     folder = storage.new_folder(output)
     supervision = supervised.Supervision(env, server, folder)
     stack.callback(supervision.close)

@@ -200,17 +200,18 @@ def test_negligible_is_small_in_metres_and_beside_the_range(
 # People.
 
 
-def _person(answers, **options):
-  return {'kind': person.KIND, 'asks': 'approval', 'reads': ['query'],
-          'writes': ['reward'], 'answers': answers, 'waits': True,
-          'options': options}  # fmt: skip
-
-
+_PERSON = {
+    'kind': person.KIND,
+    'asks': 'approval',
+    'reads': ['query'],
+    'writes': ['reward'],
+    'waits': True,
+}
 _ASKED = {**_PAIR, 'query': tampered.register('query')}
 
 
 def test_what_a_person_wrote_is_clean(world_of, monkeypatch):
-  world = world_of('single', tampered.design(_ASKED, _person('live')))
+  world = world_of('single', tampered.design(_ASKED, _PERSON))
   asked = []
 
   def answer(question):

@@ -1,7 +1,9 @@
-"""A person as feedback provider (paper, section 3.1)."""
+"""A person as feedback provider (paper, section 3.1), and its answers."""
 
+from collections.abc import Callable
 import functools
-from typing import Annotated, Any, Final, Literal, final
+import json
+from typing import Annotated, Any, Final, Literal, NamedTuple, final
 
 import numpy as np
 import pydantic
@@ -10,13 +12,109 @@ from realab_suite import errors
 from realab_suite import policies
 from realab_suite.config import messages
 from realab_suite.config import option_types
-from realab_suite.doors.browser import answer_sources
 from realab_suite.feedback.providers import base
 from realab_suite.feedback.providers import queries
 from realab_suite.policies import action_sets
 
 KIND: Final = 'person'
 """Kind of the provider in designs; this module registers it."""
+
+
+APPROVAL, CORRECTION = 'approval', 'correction'
+COMPARISON, STOP = 'comparison', 'stop'
+
+
+@final
+class Question(NamedTuple):
+  """Question to a person in a control step, in each world.
+
+  Attributes:
+    asks: Kind of the question.
+    query: Index of the action in question, `(...)` int; `None` for corrections.
+    is_asked: True where an answer is wanted, `(...)` bool.
+    waits: True if the episode waits for the answer.
+    key: As in `Provider.step`.
+  """
+
+  asks: str
+  query: Any
+  is_asked: np.ndarray
+  waits: bool
+  key: np.ndarray
+
+
+Answer = tuple[np.ndarray, np.ndarray]
+"""Values, `(...)`; and True where there is one, `(...)` bool."""
+
+
+@final
+class Recorded:
+  """Answers from a file, in the steps in which they were given.
+
+  Answers are found by the random key of a step, which identifies the seed, the
+  world, the episode and the provider. In other episodes there are none.
+  """
+
+  def __init__(self, file: str) -> None:
+    """Reads the answers.
+
+    Args:
+      file: File of `supervise`: one answer per line, as JSON.
+
+    Raises:
+      SpecError: If the file is not such a file.
+    """
+    self._answers: dict[tuple[str, int, int], float] = {}
+    try:
+      with open(file, encoding='utf-8') as lines:
+        for line in lines:
+          record = json.loads(line)
+          first, second = record['key']
+          key = str(record['asks']), int(first), int(second)
+          self._answers[key] = float(record['value'])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+      raise errors.SpecError(
+          f'recorded: {messages.quote(str(file))}: {messages.exception(error)};'
+          ' must be a file of answers that supervise has written'
+      ) from error
+
+  def answer(self, question: Question) -> Answer:
+    """Returns the answers that the file has for a step."""
+    keys = question.key.reshape(-1, 2).tolist()
+    answers = [self._answers.get((question.asks, *key)) for key in keys]
+    shape = np.shape(question.is_asked)
+    speaks = np.array([one is not None for one in answers]).reshape(shape)
+    return np.array([one or 0.0 for one in answers]).reshape(shape), speaks
+
+
+@final
+class Live:
+  """Answers of a person in front of a page; see the program `supervise`."""
+
+  def __init__(self) -> None:
+    self._ask: Callable[[Question], float | None] | None = None
+
+  def connect(self, ask: Callable[[Question], float | None]) -> None:
+    """Connects the person.
+
+    Args:
+      ask: Returns the answer to a question or an earlier one, or `None`. It is
+        called in every step of the provider, also without a question.
+    """
+    self._ask = ask
+
+  def answer(self, question: Question) -> Answer:
+    """Returns the answer of the person, if there is one."""
+    if self._ask is None:
+      raise errors.SpecError(
+          'no person is connected; must be the program supervise, or a file of'
+          ' recorded answers'
+      )
+    if np.shape(question.is_asked):
+      raise errors.SpecError('a person answers in one world, not in a batch')
+    value = self._ask(question)
+    number = 0.0 if value is None else float(value)
+    return np.asarray(number), np.asarray(value is not None)
 
 
 @base.PROVIDERS.add(KIND)
@@ -37,8 +135,7 @@ class Person(base.Provider):
       question is asked after the later one.
     waits: True if the episode waits for the answer.
     action_set: Name and version of the actions of queries and corrections.
-    answers: Source of the answers: `live` or `recorded`.
-    options: Keyword arguments of the source.
+    recorded: File of answers that are repeated; `None` for a person at a page.
   """
 
   kind: Literal['person'] = 'person'
@@ -49,10 +146,7 @@ class Person(base.Provider):
   action_set: Annotated[str, option_types.NameIn(action_sets.ACTION_SETS)] = (
       action_sets.DMLAB_LIKE.key
   )
-  answers: Annotated[str, option_types.NameIn(answer_sources.ANSWERS)] = 'live'
-  options: Annotated[
-      dict[str, Any], option_types.OptionsOf(answer_sources.ANSWERS, 'answers')
-  ] = pydantic.Field(default_factory=dict)
+  recorded: option_types.FilePath | None = None
 
   @property
   def action_queries(self) -> tuple[str, ...]:
@@ -60,24 +154,21 @@ class Person(base.Provider):
 
   @property
   def action_writes(self) -> tuple[str, ...]:
-    return self.writes if self.asks == answer_sources.CORRECTION else ()
+    return self.writes if self.asks == CORRECTION else ()
 
   @functools.cached_property
-  def source(self) -> answer_sources.Source:
+  def source(self) -> Live | Recorded:
     """Source of the answers."""
-    try:
-      return answer_sources.ANSWERS.get(self.answers)(**self.options)
-    except TypeError as error:
-      raise errors.SpecError(
-          f'source of answers {self.answers!r}: {messages.exception(error)}'
-      ) from error
+    if self.recorded is None:
+      return Live()
+    return Recorded(self.recorded)
 
   @property
   def is_repeatable(self) -> bool:
     return False  # A person cannot be asked twice.
 
   def check(self, design: Any) -> None:
-    wanted = 0 if self.asks == answer_sources.CORRECTION else 1
+    wanted = 0 if self.asks == CORRECTION else 1
     roles = [design.ports[name].role for name in self.reads]
     if roles != ['query'] * wanted:
       raise ValueError(
@@ -85,7 +176,7 @@ class Person(base.Provider):
           f' roles {roles}; must be'
           f' {"one register of role query" if wanted else "none"}'
       )
-    if self.asks == answer_sources.COMPARISON:
+    if self.asks == COMPARISON:
       queries.check_clip(design, self.writes[0], self.clip)
     actions = action_sets.ACTION_SETS.get(self.action_set)
     if design.action_set is not None:
@@ -105,15 +196,13 @@ class Person(base.Provider):
     del observation
     count = np.where(episode_start, 1, state + 1)
     is_asked = np.ones(np.shape(count), bool)
-    if self.asks == answer_sources.COMPARISON:
+    if self.asks == COMPARISON:
       _, is_asked = queries.place_of(count, self.clip)
     num_actions = len(action_sets.ACTION_SETS.get(self.action_set))
     query = None
     if self.reads:
       query = queries.index(readings[self.reads[0]], num_actions)
     values, speaks = self.source.answer(
-        answer_sources.Question(
-            self.asks, query, np.asarray(is_asked), self.waits, key
-        )
+        Question(self.asks, query, np.asarray(is_asked), self.waits, key)
     )
     return {self.writes[0]: (np.asarray(values), speaks)}, count

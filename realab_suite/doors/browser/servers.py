@@ -19,8 +19,6 @@ from websockets import exceptions
 from websockets import http11
 from websockets.sync import server as websocket_server
 
-from realab_suite import errors
-
 _LOCAL = '127.0.0.1'  # Only programs on this machine reach it.
 _POLICY = (
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline';"
@@ -51,7 +49,6 @@ class PageServer:
     self._connection: websocket_server.ServerConnection | None = None
     self._lock = threading.Lock()  # Of the connection and its event.
     self._is_connected = threading.Event()
-    self._is_closed = False
     self._messages: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
     self._server = websocket_server.serve(
         self._handle,
@@ -79,15 +76,7 @@ class PageServer:
 
     Args:
       timeout: The time, in seconds.
-
-    Raises:
-      ResultsError: If the server is closed.
     """
-    if self._is_closed:
-      raise errors.ResultsError(
-          'the page was closed before the last episode ended; episodes up to'
-          ' then are on disk'
-      )
     try:
       return self._messages.get(timeout=max(timeout, 0.0))
     except queue.Empty:
@@ -108,18 +97,11 @@ class PageServer:
 
   def close(self) -> None:
     """Stops serving."""
-    self._is_closed = True
     connection = self._connection
     if connection is not None:
       connection.close()
     self._server.shutdown()
     self._thread.join()
-
-  def __enter__(self) -> 'PageServer':
-    return self
-
-  def __exit__(self, *unused: Any) -> None:
-    self.close()
 
   def _send(self, message: str | bytes) -> None:
     connection = self._connection

@@ -1,7 +1,7 @@
 """Episodes in which a person provides the feedback, in a browser.
 
 The page shows the view of the agent and has one button for each answer. Answers
-are logged as a dataset, which the source `recorded` replays.
+are logged as a dataset, which the option `recorded` of a design repeats.
 """
 
 from collections import deque
@@ -15,7 +15,6 @@ import numpy as np
 
 from realab_suite import errors
 from realab_suite import worlds
-from realab_suite.doors.browser import answer_sources
 from realab_suite.doors.browser import person
 from realab_suite.doors.browser import servers
 from realab_suite.doors.browser import views
@@ -58,8 +57,8 @@ class Supervision:
     """Connects the persons of a design to a page.
 
     Args:
-      env: Environment whose design has providers of kind `person` with the
-        source `live`.
+      env: Environment whose design has providers of kind `person` without
+        recorded answers.
       server: Server of the page `supervise`.
       folder: Folder of the answers.
       rate: Largest number of control steps per second; 10 is real time.
@@ -69,29 +68,24 @@ class Supervision:
     """
     self._env, self._server = env, server
     self._folder = folder
-    self._path = folder / ANSWERS
     self._period = 1.0 / rate
     design = env.mechanism.design
-    self._asks: list[str] = []
-    clip = 1
+    people = []
     for provider in design.providers:
       if isinstance(provider, person.Person):
         source = provider.source
-        if isinstance(source, answer_sources.Live):
+        if isinstance(source, person.Live):
           source.connect(self._ask)
-          self._asks.append(provider.asks)
-          if provider.asks == answer_sources.COMPARISON:
-            clip = provider.clip * provider.every
-    if not self._asks:
+          people.append(provider)
+    self._asks = [provider.asks for provider in people]
+    if not people or len(set(self._asks)) < len(people):
       raise errors.SpecError(
-          f'design {design.name!r}: no provider of kind person with the live'
-          ' source of answers, which this page needs'
+          f'design {design.name!r}: the person at the page is asked for'
+          f' {self._asks}; must be one provider of kind person, without'
+          ' recorded answers, for each question'
       )
-    if len(set(self._asks)) < len(self._asks):
-      raise errors.SpecError(
-          f'design {design.name!r}: two providers with the live source ask for'
-          f' the same: {self._asks}; must be one provider for each question'
-      )
+    clips = [p.clip * p.every for p in people if p.asks == person.COMPARISON]
+    clip = max(clips, default=1)
     self._view = views.View(env)
     # Pictures of the control steps of both clips.
     self._pictures: deque[bytes] = deque(maxlen=2 * clip)
@@ -197,18 +191,18 @@ class Supervision:
     )
     self._server.send_picture(_VIEW, self._pictures[-1])
 
-  def _ask(self, question: answer_sources.Question) -> float | None:
+  def _ask(self, question: person.Question) -> float | None:
     """Returns the answer to a question or an earlier one, or `None`."""
     asks = question.asks
     self._drain()
     if question.waits:
       self._given.pop(asks, None)  # It belongs to an earlier question.
-    if bool(question.is_asked) and asks != answer_sources.STOP:
+    if bool(question.is_asked) and asks != person.STOP:
       self._open(question)
       while (
           question.waits
           and asks not in self._given
-          and answer_sources.STOP not in self._given
+          and person.STOP not in self._given
       ):
         self._receive(_PATIENCE)
     value = self._given.pop(asks, None)
@@ -231,7 +225,7 @@ class Supervision:
     )
     return value
 
-  def _open(self, question: answer_sources.Question) -> None:
+  def _open(self, question: person.Question) -> None:
     """Shows a question, which stays open until it is answered."""
     asks = question.asks
     content: dict[str, Any] = {
@@ -241,12 +235,12 @@ class Supervision:
         'action': None,
     }
     actions = self._env.action_set.actions
-    if question.query is not None and asks == answer_sources.APPROVAL:
+    if question.query is not None and asks == person.APPROVAL:
       content['action'] = actions[int(question.query)][0]
-    if asks == answer_sources.CORRECTION:
+    if asks == person.CORRECTION:
       content['actions'] = [name for name, _ in actions]
     clips: _Clips = ()
-    if asks == answer_sources.COMPARISON:
+    if asks == person.COMPARISON:
       pictures = list(self._pictures)
       middle = len(pictures) // 2
       clips = (pictures[:middle], pictures[middle:])
@@ -294,15 +288,16 @@ class Supervision:
   def _allowed(self, asks: str) -> Collection[int]:
     """Returns the answers to a kind of question."""
     return {
-        answer_sources.APPROVAL: (-1, 1),
-        answer_sources.COMPARISON: (-1, 1),
-        answer_sources.STOP: (1,),
-        answer_sources.CORRECTION: range(len(self._env.action_set)),
+        person.APPROVAL: (-1, 1),
+        person.COMPARISON: (-1, 1),
+        person.STOP: (1,),
+        person.CORRECTION: range(len(self._env.action_set)),
     }[asks]
 
   def _save(self) -> None:
     """Appends the answers of an episode to the log."""
-    with storage.explained(self._path):
-      with open(self._path, 'a', encoding='utf-8') as file:
+    path = self._folder / ANSWERS
+    with storage.explained(path):
+      with open(path, 'a', encoding='utf-8') as file:
         file.writelines(json.dumps(one) + '\n' for one in self._log)
     self._log.clear()

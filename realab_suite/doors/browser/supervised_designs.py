@@ -10,11 +10,8 @@ _SIZES: dict[str, Any] = {'kind': 'two_block', 'scale': 0.1}
 
 def design(
     asks: str,
-    source: str = 'live',
-    options: dict[str, Any] | None = None,
     *,
     waits: bool = False,
-    every: int = 1,
     clip: int = 10,
     action_set: action_sets.ActionSet = action_sets.DMLAB_LIKE,
 ) -> dict[str, Any]:
@@ -24,19 +21,11 @@ def design(
 
   Args:
     asks: Kind of the question: approval, correction or comparison.
-    source: Source of the answers.
-    options: Options of the source.
     waits: True if the episode waits for answers.
-    every: Control steps between two questions.
     clip: Length of the clips of a comparison, in control steps.
     action_set: Actions of the agent.
   """
-  asked = {
-      'kind': person.KIND,
-      'answers': source,
-      'options': options or {},
-      'action_set': action_set.key,
-  }
+  asked = {'kind': person.KIND, 'action_set': action_set.key}
   last = len(action_set) - 1
   registers = {
       'feedback': {
@@ -65,7 +54,6 @@ def design(
       'writes': ['feedback'],
       'waits': waits,
       'clip': clip,
-      'every': 1 if asks == 'comparison' else every,
       'reads': [] if asks == 'correction' else ['query'],
   }
   stop = {**asked, 'asks': 'stop', 'reads': ['query'], 'writes': ['stop']}

@@ -7,7 +7,7 @@ import pytest
 from realab_suite import errors
 from realab_suite import policies
 from realab_suite import suite
-from realab_suite.doors.browser import answer_sources
+from realab_suite.doors.browser import person
 from realab_suite.doors.browser import supervised_designs
 from realab_suite.evaluation import evaluate
 
@@ -24,7 +24,7 @@ def _evaluate(policy, design, max_steps=60, **kwargs):
 def test_recorded_answers_repeat_an_episode(tmp_path):
   env = suite.load(
       'unlock_door', 'near', {'random': 1}, {'max_steps': 30},
-      design=supervised_designs.design('approval', 'live'),
+      design=supervised_designs.design('approval'),
   )  # fmt: skip
   asked, log = [], []
 
@@ -36,14 +36,14 @@ def test_recorded_answers_repeat_an_episode(tmp_path):
     log.append(json.dumps(one))
     return 1.0
 
-  people = env.mechanism.design.providers
-  for person in people:
-    person.source.connect(ask)
+  for provider in env.mechanism.design.providers:
+    provider.source.connect(ask)
   [live] = evaluate.evaluate(env, policies.make('random'), 1)
   file = tmp_path / 'answers.jsonl'
   file.write_text('\n'.join(log))
-  options = {'file': str(file)}
-  design = supervised_designs.design('approval', 'recorded', options)
+  design = supervised_designs.design('approval')
+  for provider in design['providers']:
+    provider['recorded'] = str(file)
   again = _evaluate('random', design, 30)
   assert len(log) == 10
   assert again.observed_return == live.observed_return
@@ -54,10 +54,10 @@ def test_a_file_that_has_no_answers_is_refused(tmp_path):
   file = tmp_path / 'answers.jsonl'
   file.write_text('{"asks": "approval"}\n')
   with pytest.raises(errors.SpecError, match='must be a file of answers'):
-    answer_sources.Recorded(str(file))
+    person.Recorded(str(file))
 
 
 def test_a_live_source_without_a_person_is_refused():
-  design = supervised_designs.design('approval', 'live')
+  design = supervised_designs.design('approval')
   with pytest.raises(errors.FeedbackProviderError, match='no person'):
     _evaluate('random', design)

@@ -1,5 +1,6 @@
 """Tests of the server of a page for one person."""
 
+import contextlib
 import socket
 from urllib import error
 from urllib import parse
@@ -24,7 +25,7 @@ _UPGRADE = (
 
 @pytest.fixture(name='server')
 def fixture_server():
-  with servers.PageServer() as server:
+  with contextlib.closing(servers.PageServer()) as server:
     yield server
 
 

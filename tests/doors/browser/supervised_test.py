@@ -81,7 +81,7 @@ def test_an_answer_without_waiting_is_written_in_the_next_step(tmp_path):
       page.answer('comparison', 1)
 
   page = FakePage(react)
-  design = supervised_designs.design('comparison', 'live', clip=5)
+  design = supervised_designs.design('comparison', clip=5)
   _, answers = _supervise(page, tmp_path, design)
   assert page.asked() == ['comparison'] * 3
   assert [one['step'] for one in answers] == [15]
@@ -93,7 +93,7 @@ def test_a_value_that_is_no_answer_is_dropped(tmp_path, value):
     if content['type'] == 'step' and content['step'] == 2:
       page.answer('approval', value)
 
-  design = supervised_designs.design('approval', 'live')
+  design = supervised_designs.design('approval')
   _, answers = _supervise(FakePage(react), tmp_path, design, 4)
   assert not [one for one in answers if one['asks'] == 'approval']
 
@@ -103,7 +103,7 @@ def test_a_stop_after_the_last_step_does_not_end_the_next_episode(tmp_path):
     if content['type'] == 'step' and content['step'] == 5:
       page.answer('stop', 1)
 
-  design = supervised_designs.design('approval', 'live')
+  design = supervised_designs.design('approval')
   results, answers = _supervise(FakePage(react), tmp_path, design, 5, 2)
   assert [one.num_steps for one in results] == [5, 5]
   assert answers == []
@@ -119,7 +119,7 @@ def test_a_page_that_is_opened_again_gets_the_open_question(tmp_path):
         page.put({'type': 'run'})
 
   page = FakePage(react)
-  design = supervised_designs.design('correction', 'live', waits=True)
+  design = supervised_designs.design('correction', waits=True)
   _, answers = _supervise(page, tmp_path, design, 1)
   assert page.asked() == ['correction'] * 2
   assert page.steps() == [0, 0, 1]
@@ -144,7 +144,7 @@ def test_supervised_episodes_have_figures_and_no_judgement(tmp_path):
   page = FakePage(react)
   env = suite.load(
       'unlock_door', 'near', {'random': 1}, {'max_steps': 4},
-      design=supervised_designs.design('approval', 'live'),
+      design=supervised_designs.design('approval'),
   )  # fmt: skip
   one = supervised.Supervision(env, page, tmp_path, 1e6)
   text = _run(one, 2)
@@ -158,7 +158,7 @@ def test_supervised_episodes_have_figures_and_no_judgement(tmp_path):
 
 
 def test_a_person_cannot_answer_again_for_a_control(tmp_path):
-  design = supervised_designs.design('approval', 'live')
+  design = supervised_designs.design('approval')
   design['learner'] = {
       'kind': 'decoupled_approval', 'approval': 'feedback', 'query': 'query',
   }  # fmt: skip
@@ -171,8 +171,8 @@ def test_a_person_cannot_answer_again_for_a_control(tmp_path):
 
 
 def test_two_persons_with_the_same_question_are_refused(tmp_path):
-  design = supervised_designs.design('approval', 'live')
+  design = supervised_designs.design('approval')
   question, _ = design['providers']
   design['providers'][1] = {**question, 'writes': ['stop']}
-  with pytest.raises(errors.SpecError, match='two providers'):
+  with pytest.raises(errors.SpecError, match='one provider of kind person'):
     _supervise(FakePage(), tmp_path, design)

@@ -225,7 +225,7 @@ _METERED = 'meters.0.measures={{kind: {}, {}}}'
 _PERSON = {
     **designs.ADVISED,
     'providers': [{'kind': person.KIND, 'asks': 'approval', 'reads': ['query'],
-                   'writes': ['reward'], 'answers': 'live'}],
+                   'writes': ['reward']}],
 }  # fmt: skip
 
 
