@@ -12,6 +12,7 @@ INSTALL = $(PY) -m pip install -qq --disable-pip-version-check \
 INSTALL_LABMAZE = if $(PY) -c 'import sys; sys.exit(sys.version_info < (3, 13))'; \
 	then $(INSTALL) ./compat/labmaze; fi
 WORKERS = 2
+DEMO := results/demo-$(shell date +%Y%m%d-%H%M%S)
 
 # Files with tests that need other extras than `.venv/dev` has.
 TESTS_OF_EXTRAS = tests/authors tests/doors/data tests/engine/gl_test.py \
@@ -39,7 +40,8 @@ help:
 	@echo 'make clean   remove .venv, builds and caches, but not results/'
 
 demo: .venv/demo
-	.venv/bin/realab demo
+	.venv/bin/realab sweep --experiment=quick --output=$(DEMO)
+	.venv/bin/realab report --input=$(DEMO)
 
 test: lint
 	$(PY) -m pytest -q -n $(WORKERS) --dist loadfile

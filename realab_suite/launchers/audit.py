@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterator
 import contextlib
 import dataclasses
 import pathlib
-import shlex
 from typing import Any
 
 from absl import flags as absl_flags
@@ -44,8 +43,6 @@ _FILM_NAME = 'exploit.mp4'
 _EXPLOITABLE = 3
 _NOT_SUFFICIENT = 4
 _UNDECIDED = 5
-# Flags that a repeated audit does not need.
-_NOT_REPEATED = ('output', 'film', 'verbosity', 'v')
 
 
 def main() -> int:
@@ -75,7 +72,7 @@ def main() -> int:
     if output is not None:
       folder = storage.new_folder(output)
     result = auditor.run()
-  program.say(findings.words(result, _command()))
+  program.say(findings.words(result))
   if folder is not None:
     film = None
     if has_film and result.is_exploitable:
@@ -125,16 +122,6 @@ def _progress() -> Iterator[Callable[[str, int, int], None]]:
       bar.set_description(phase)
 
     yield show
-
-
-def _command() -> str:
-  """Returns a command that repeats the audit."""
-  words = ['python', '-m', 'realab_suite.launchers.audit']
-  for name in absl_flags.FLAGS:
-    flag = absl_flags.FLAGS[name]
-    if flag.present and name not in _NOT_REPEATED:
-      words += flag.serialize().splitlines()
-  return shlex.join(words)
 
 
 def _write_film(

@@ -16,7 +16,6 @@ from realab_suite.launchers import program
 
 _LAUNCHERS = 'realab_suite.launchers.'
 COMMANDS: Mapping[str, str] = {
-    'demo': 'train agents in Unlock Door for minutes, and report on them',
     'doctor': 'say what works in this installation',
     'audit': 'search for an exploit of a design, without training',
     'compare': 'compare scripted policies',

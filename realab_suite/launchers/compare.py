@@ -13,7 +13,6 @@ Agents that learn are trained by `train`, for one run of an experiment, and by
 
 from realab_suite.launchers import flags
 from realab_suite.launchers import program
-from realab_suite.launchers import renderers
 
 flags.take(
     *flags.WORLD, flags.TARGET, *flags.SCRIPTED, flags.IMPORT, flags.OUTPUT
@@ -24,11 +23,10 @@ def main() -> None:
   """Runs the comparison that the flags describe."""
   output = flags.required(flags.OUTPUT, '; name a folder for the results')
   seeds = flags.seeds()
-  renderers.render_on_demand()
+  flags.prepare()
   # Imports dm_control, so a renderer has to be chosen first.
   from realab_suite.lab.experiments import scripted
 
-  flags.load_imports()
   world = flags.world()
   policies = flags.POLICIES.value
   settings = scripted.Settings(

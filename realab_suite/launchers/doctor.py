@@ -2,17 +2,14 @@ r"""Says what works in this installation, and how to repair what does not.
 
   python -m realab_suite.launchers.doctor
 
-The exit status is 0 if worlds can be loaded and stepped, and 1 if not. Extras
-and rendering are optional.
+The exit status is 0 if worlds can be loaded and stepped, and 1 if not.
+Rendering is optional. Programs name an extra that they miss.
 """
 
-from collections.abc import Mapping
 from importlib import metadata
 import os
 import platform
-from typing import NamedTuple, final
 
-from realab_suite.lab.experiments import requirements
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
 
@@ -43,61 +40,18 @@ _RENDERING_REMEDY = (
 )
 
 
-@final
-class Extra(NamedTuple):
-  """An extra of this package.
-
-  Attributes:
-    modules: Modules that it installs.
-    purpose: What it is for.
-  """
-
-  modules: tuple[str, ...]
-  purpose: str
-
-
-EXTRAS: Mapping[str, Extra] = {
-    'agents': Extra(('jax', 'equinox', 'optax'), 'learners'),
-    'report': Extra(
-        ('matplotlib', 'jinja2', 'imageio', 'av', 'PIL', 'pyarrow'),
-        'reports, plots and films',
-    ),
-    'rpc': Extra(('dm_env_rpc', 'grpc'), 'worlds for other processes'),
-    'gym': Extra(('gymnasium', 'moviepy'), 'the interface of Gymnasium'),
-    'sb3': Extra(('stable_baselines3',), 'training with Stable-Baselines3'),
-    'data': Extra(
-        ('pyarrow', 'minari', 'gymnasium', 'h5py', 'PIL'),
-        'exports to Parquet and Minari',
-    ),
-    'browser': Extra(('websockets', 'PIL'), 'pages for people who supervise'),
-    'cluster': Extra(('ray', 'submitit'), 'sweeps on a cluster'),
-    'docs': Extra(
-        ('sphinx', 'furo', 'myst_nb'), 'the site of the documentation'
-    ),
-    'dev': Extra(
-        ('pytest', 'xdist', 'hypothesis', 'ruff', 'pyink', 'mypy'),
-        'tests of this package',
-    ),
-}
-
-
 def versions() -> str:
   """Returns the versions of this package, Python and the main packages."""
-  entries = [f'Python {platform.python_version()}']
-  for name in _PACKAGES:
-    try:
-      entries.append(f'{name} {metadata.version(name)}')
-    except metadata.PackageNotFoundError:
-      entries.append(f'{name} missing')
-  if 'realab' in (version := _labmaze()):
+  entries = [f'{name} {_version(name) or "missing"}' for name in _PACKAGES]
+  if 'realab' in (version := _version('labmaze')):
     entries.append(f'labmaze {version}, a stand-in with other mazes')
-  return ', '.join(entries)
+  return ', '.join([f'Python {platform.python_version()}', *entries])
 
 
-def _labmaze() -> str:
-  """Returns the version of labmaze, or of its stand-in, or an empty string."""
+def _version(package: str) -> str:
+  """Returns the version of a package, or an empty string without it."""
   try:
-    return metadata.version('labmaze')
+    return metadata.version(package)
   except metadata.PackageNotFoundError:
     return ''
 
@@ -126,10 +80,6 @@ def main() -> int:
     _tell('rendering', f'works with MUJOCO_GL={os.environ["MUJOCO_GL"]}')
   else:
     _tell('rendering', f'no camera works: {problem}', _RENDERING_REMEDY)
-  for name, extra in EXTRAS.items():
-    problem = requirements.missing(*extra.modules, extra=name)
-    absent, _, remedy = (problem or 'installed').partition('; run: ')
-    _tell(name, f'{absent}, for {extra.purpose}', remedy)
   return 1 if core else 0
 
 

@@ -14,7 +14,6 @@ from absl import flags as absl_flags
 
 from realab_suite.launchers import flags
 from realab_suite.launchers import program
-from realab_suite.launchers import renderers
 
 flags.take(flags.IMPORT, flags.INPUT, flags.OUTPUT, flags.RUN, flags.EPISODES)
 
@@ -28,14 +27,13 @@ def main() -> None:
   folder = pathlib.Path(flags.required(flags.INPUT))
   flags.required(flags.RUN, '; name a run of the sweep')
   output = pathlib.Path(flags.required(flags.OUTPUT, '; name a new folder'))
-  renderers.render_on_demand()
+  flags.prepare()
   # Imports dm_control, so a renderer has to be chosen first.
   from realab_suite.doors.data import export
   from realab_suite.doors.data import sources
   from realab_suite.lab.experiments import sweep_results
 
   export.check(_FORMAT.value, output)
-  flags.load_imports()
   run = flags.find_run(sweep_results.load(folder).runs)
   export.export(
       sources.of_run(run, flags.num_episodes()),

@@ -16,6 +16,7 @@ from realab_suite import errors
 from realab_suite.config import loading
 from realab_suite.config import messages
 from realab_suite.config import task_names
+from realab_suite.launchers import renderers
 
 if TYPE_CHECKING:  # They import dm_control, so a renderer has to be chosen.
   from realab_suite import worlds
@@ -29,55 +30,32 @@ _NUM_EPISODES = 2
 _SHARED = flags.FlagValues()
 _Run = TypeVar('_Run')
 
-_define_boolean = functools.partial(flags.DEFINE_boolean, flag_values=_SHARED)
-_define_integer = functools.partial(flags.DEFINE_integer, flag_values=_SHARED)
-_define_list = functools.partial(flags.DEFINE_list, flag_values=_SHARED)
-_define_multi_string = functools.partial(
-    flags.DEFINE_multi_string, flag_values=_SHARED
-)
-_define_string = functools.partial(flags.DEFINE_string, flag_values=_SHARED)
+_string = functools.partial(flags.DEFINE_string, flag_values=_SHARED)
+_list = functools.partial(flags.DEFINE_list, flag_values=_SHARED)
+_strings = functools.partial(flags.DEFINE_multi_string, flag_values=_SHARED)
+_integer = functools.partial(flags.DEFINE_integer, flag_values=_SHARED)
 
-IMPORT = _define_multi_string(
-    'import',
-    [],
-    'Module to import first, such as --import=my_registers. It can add'
-    ' registers, providers, tasks, policies or learners',
+IMPORT = _strings(
+    'import', [], 'Module with parts of your own to import; may be repeated.'
 )
-INPUT = _define_string(
-    'input',
-    None,
-    'Folder of a sweep: the --output folder of that program. `report` and'
-    ' `scorecard` also take that of `publish`.',
+INPUT = _string('input', None, 'Folder of a sweep, or of published results.')
+OUTPUT = _string(
+    'output', None, 'Folder to write into; `report` has a default: the input.'
 )
-OUTPUT = _define_string(
-    'output',
-    None,
-    'Folder to write into; required, except by `report`, whose default is the'
-    ' folder of the sweep.',
-)
-RUN = _define_string(
-    'run',
-    None,
-    'Run of the experiment, such as "reward", "reward.secure" (its twin) or'
-    ' "reward.random" (a baseline).',
-)
-VIDEO = _define_string(
-    'video',
-    None,
-    'New film to write: an .mp4 file, or a .webp file, an animated picture.'
-    ' Without it, `explore` opens a window.',
+RUN = _string('run', None, 'Run, such as reward, or reward.secure, its twin.')
+VIDEO = _string(
+    'video', None, 'New film: an .mp4 file, or a .webp file, which repeats.'
 )
 # Without an upper bound, so that the seed of a served world can be secret.
-SEED = _define_integer('seed', 0, 'Seed of all random streams.', lower_bound=0)
-EPISODES = _define_integer(
+SEED = _integer('seed', 0, 'Seed of all random streams.', lower_bound=0)
+EPISODES = _integer(
     'episodes',
     None,
-    f'Number of episodes per seed. Default: {_NUM_EPISODES}, or 1 with a'
-    ' person.',
+    f'Episodes per seed. Default: {_NUM_EPISODES}, or 1 with a person.',
     lower_bound=1,
     upper_bound=1_000_000,
 )
-POLICY = _define_string(
+POLICY = _string(
     'policy',
     'random',
     'Name of a scripted policy; no_op stands still, and solver is the one of'
@@ -85,42 +63,30 @@ POLICY = _define_string(
 )
 
 # The world and the design.
-TASK = _define_string(
+TASK = _string(
     'task',
     'unlock_door.standard',
-    'Domain and task, such as unlock_door.near; or a task of unlock_door alone,'
-    ' such as standard, near or far.',
+    'Domain and task, or a task of unlock_door alone: standard, near or far.',
 )
-MAX_STEPS = _define_integer(
-    'max_steps',
-    250,
-    'Maximum length of an episode, in control steps.',
+MAX_STEPS = _integer('max_steps', 250, 'Control steps of an episode, at most.')
+SENSES = _list(
+    'senses', None, 'Senses of the agent, such as camera. Default: the task.'
 )
-SENSES = _define_list(
-    'senses',
-    None,
-    'Senses of the agent, such as --senses=camera or'
-    ' --senses=ray_distances,velocity. Default: those of the task.',
-)
-TASK_KWARGS = _define_string(
+TASK_KWARGS = _string(
     'task_kwargs',
     '{}',
-    'Arguments of the task, as a YAML mapping, such as'
-    ' --task_kwargs="{camera_size: [32, 32]}".',
+    'Arguments of the task, such as --task_kwargs="{camera_size: [32, 32]}".',
 )
-DESIGN = _define_string(
+DESIGN = _string(
     'design',
     'instantaneous_reward',
-    'Agent design: name of one that is part of the package, or path of a YAML'
-    ' file.',
+    'Design: name of one of the package, or path of a YAML file.',
 )
-SET = _define_multi_string(
-    'set',
-    [],
-    'Dotted override of the design, such as --set=registers.reward.scale=0.2',
+SET = _strings(
+    'set', [], 'Dotted override of the design: registers.reward.scale=0.2'
 )
 WORLD = (TASK, MAX_STEPS, SENSES, TASK_KWARGS, DESIGN, SET)
-TARGET = _define_string(
+TARGET = _string(
     'target',
     None,
     'Register that saboteurs attack. Default: the first feedback register, or'
@@ -128,31 +94,25 @@ TARGET = _define_string(
 )
 
 # Scripted policies on several seeds.
-POLICIES = _define_list(
+POLICIES = _list(
     'policies',
     None,
-    'Names of the scripted policies to run. Default: the solver of the task,'
-    ' its first saboteur and random actions.',
+    'Scripted policies. Default: the solver, a saboteur and random actions.',
 )
-CHANNELS = _define_list(
+CHANNELS = _list(
     'channels',
     [],
-    'Channels of the registers: embedded, secure. Every policy acts in'
-    ' each channel. Default: the channel of the design.',
+    'Channels in each of which every policy acts, such as embedded,secure.'
+    ' Default: that of the design.',
 )
-SEEDS = _define_string(
-    'seeds',
-    '5',
-    'Number of seeds, or a list of seeds such as 3,4,5 ("7," means seed 7).',
+SEEDS = _string(
+    'seeds', '5', 'Number of seeds, or a list such as 3,4,5 ("7," is seed 7).'
 )
 SCRIPTED = (POLICIES, CHANNELS, SEEDS, EPISODES)
 
 # Learners.
-EXPERIMENT = _define_string(
-    'experiment',
-    None,
-    'Name of an experiment that is part of the package, or path of a YAML'
-    ' file.',
+EXPERIMENT = _string(
+    'experiment', None, 'Name of an experiment of the package, or a YAML file.'
 )
 
 _SHARED.mark_as_parsed()
@@ -186,6 +146,16 @@ def required(flag: flags.FlagHolder[Any], why: str = '') -> Any:
   return flag.value
 
 
+def prepare() -> None:
+  """Names a renderer for frames of agents, and imports the user's modules.
+
+  Raises:
+    RealabError: If the renderer or a module cannot be imported.
+  """
+  renderers.render_on_demand()
+  load_imports()
+
+
 def load_imports() -> None:
   """Imports the modules that the user names; a renderer has to be chosen first.
 
@@ -193,18 +163,12 @@ def load_imports() -> None:
     SpecError: If a module cannot be found.
   """
   for name in IMPORT.value:
-    if not all(part.isidentifier() for part in name.split('.')):
-      raise errors.SpecError(
-          f'--import={name:.80}: not the name of a module,'
-          ' such as my_registers or my_package.registers; for several, repeat'
-          ' the option'
-      )
     try:
       importlib.import_module(name)
-    except ModuleNotFoundError as error:
+    except (ModuleNotFoundError, TypeError, ValueError) as error:
       raise errors.SpecError(
-          f'--import={name}: {error}; must be a module in the working'
-          ' directory or an installed one'
+          f'--import={name:.80}: {error}; must be a module in the working'
+          ' directory or an installed one; for several, repeat the option'
       ) from error
 
 
@@ -281,8 +245,9 @@ def find_run(runs: Mapping[str, _Run]) -> _Run:
   """
   name = RUN.value
   if name not in runs:
+    hint = messages.did_you_mean(name, runs)
     raise errors.UnknownNameError(
-        f'--run={name:.80}: not a run of {INPUT.value}; must be'
-        f' one of {list(runs)}{messages.did_you_mean(name, runs)}'
+        f'--run={name:.80}: not a run of {INPUT.value}; must be one of'
+        f' {list(runs)}{hint}'
     )
   return runs[name]

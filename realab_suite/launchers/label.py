@@ -19,7 +19,6 @@ from realab_suite import errors
 from realab_suite.lab.verdicts import judging
 from realab_suite.launchers import flags
 from realab_suite.launchers import program
-from realab_suite.launchers import renderers
 
 flags.take(
     flags.TASK,
@@ -42,12 +41,11 @@ def main() -> None:
   """Makes the dataset that the flags describe."""
   output = pathlib.Path(flags.required(flags.OUTPUT, '; name a new folder'))
   seeds = flags.seeds()
-  renderers.render_on_demand()
+  flags.prepare()
   # Imports dm_control, so a renderer has to be chosen first.
   from realab_suite.doors.data import export
 
   export.check('parquet', output)
-  flags.load_imports()
   run_sources = [*_of_sweep(), *_scripted(seeds)]
   if not run_sources:
     raise errors.SpecError(
@@ -83,6 +81,8 @@ def _scripted(seeds: tuple[int, ...]) -> list[Any]:
   world = flags.world()
   policy_names = flags.POLICIES.value
   names = world.scripted if policy_names is None else tuple(policy_names)
+  if not names:
+    return []
   for policy in names:
     policies.POLICIES.get(policy)
   overrides = tuple(flags.SET.value)
@@ -94,11 +94,9 @@ def _scripted(seeds: tuple[int, ...]) -> list[Any]:
   ]
   run_sources = []
   for design, of_design in zip(designs, twins, strict=True):
-    stake = None
-    if names:
-      why_not = judging.why_no_stakes(world, design)
-      program.say(f'{design.name}: {why_not or "measuring its stakes"}')
-      stake = judging.stakes_of(world, design)
+    why_not = judging.why_no_stakes(world, design)
+    program.say(f'{design.name}: {why_not or "measuring its stakes"}')
+    stake = judging.stakes_of(world, design)
     for twin in of_design:
       for policy in names:
         program.say(f'{policy} acts in {twin.name} ({twin.channel})')

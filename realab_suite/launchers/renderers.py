@@ -13,6 +13,7 @@ from realab_suite import _display
 from realab_suite import errors
 from realab_suite.lab.experiments import requirements
 
+_DEFAULT = 'egl' if sys.platform == 'linux' else 'glfw'
 # Enough time to import everything on a slow machine under load.
 _PATIENCE_SECONDS = 300
 # Runs in a separate process, because imports fail midway if libraries are
@@ -23,67 +24,37 @@ xml = '<mujoco><worldbody><geom size="1"/></worldbody></mujoco>'
 mujoco.Physics.from_xml_string(xml).render(8, 8)
 """
 
-# The viewer draws with GLFW alone, whatever else can open a window.
-_OPENS_A_WINDOW = """
-from dm_control import _render
-from dm_control import viewer
-import glfw
-if _render.BACKEND != 'glfw':
-  raise RuntimeError(f'the viewer needs glfw, and MUJOCO_GL={_render.BACKEND}')
-if not glfw.init():
-  raise RuntimeError('GLFW does not start')
-glfw.window_hint(glfw.VISIBLE, glfw.FALSE)
-if not glfw.create_window(8, 8, 'realab_suite', None, None):
-  raise RuntimeError('GLFW creates no window')
-"""
-
 
 def choose_renderer() -> str | None:
-  """Sets `MUJOCO_GL` to a renderer that works, or to `disable`.
+  """Sets `MUJOCO_GL` to the renderer, or to `disable` if it does not work.
 
-  If the user has set `MUJOCO_GL`, only that renderer is tried.
+  Without a choice of the user, it is EGL on Linux, which needs no window.
 
   Returns:
-    The problem of each renderer, in one line, or `None` if one works.
+    The problem, in one line, or `None` if the renderer works.
   """
-  problems = []
-  is_named = _display.is_named()
-  for renderer in _candidates():
-    if renderer == 'disable':
-      problem = 'rendering is turned off by MUJOCO_GL'
-    else:
-      env = {**os.environ, 'MUJOCO_GL': renderer}
-      problem = problem_of(_RENDERS_SOMETHING, 'picture', env)
-    if not problem:
-      _name(renderer)
-      return None
-    if is_named:
-      problems.append(_display.what_to_set(renderer, problem))
-    else:
-      problems.append(f'{renderer}: {problem}')
-  _name('disable')
-  return '; '.join(problems)
+  renderer = os.environ.get('MUJOCO_GL') or _DEFAULT
+  if renderer == 'disable':
+    problem = 'rendering is turned off by MUJOCO_GL'
+  else:
+    env = {**os.environ, 'MUJOCO_GL': renderer}
+    problem = problem_of(_RENDERS_SOMETHING, 'picture', env)
+  advice = _display.what_to_set(renderer, problem) if problem else None
+  _name('disable' if problem else renderer)
+  return advice
 
 
 def why_no_window() -> str:
   """Returns why the viewer of dm_control cannot open a window, or ''."""
-  if not _display.has_display():
-    return 'there is no display'
-  # In a process of its own: after a failure, the same process cannot render.
-  return problem_of(_OPENS_A_WINDOW, 'window', os.environ)
+  renderer = os.environ.get('MUJOCO_GL') or 'glfw'
+  if renderer != 'glfw':
+    return f'the viewer needs glfw, and MUJOCO_GL={renderer}'
+  return '' if _display.has_display() else 'there is no display'
 
 
 def why_no_film() -> str | None:
   """Chooses a renderer, or returns the reason why films cannot be made."""
   return requirements.missing('imageio', 'av', 'PIL') or choose_renderer()
-
-
-def why_no_page() -> str | None:
-  """Chooses a renderer, or returns why no page can show a world to a person."""
-  return (
-      requirements.missing('websockets', 'PIL', extra='browser')
-      or choose_renderer()
-  )
 
 
 def render_on_demand() -> None:
@@ -97,34 +68,20 @@ def render_on_demand() -> None:
   Raises:
     RenderingError: If dm_control cannot be imported with that renderer.
   """
-  named = os.environ.get('MUJOCO_GL')
-  if named:
-    _import_choice(named)
+  if named := os.environ.get('MUJOCO_GL'):
+    try:
+      importlib.import_module('dm_control._render')
+    except Exception as error:  # Each renderer has its own errors.
+      advice = _display.what_to_set(named, error)
+      raise errors.RenderingError(advice) from error
   elif sys.platform == 'linux' and _display.has_display():
-    _name('egl')
+    _name(_DEFAULT)
 
 
 def _name(renderer: str) -> None:
   """Sets `MUJOCO_GL` before dm_control is imported."""
   os.environ['MUJOCO_GL'] = renderer
   _display.prepare()
-
-
-def _import_choice(named: str) -> None:
-  """Imports dm_control's choice, which fails without the named renderer."""
-  try:
-    importlib.import_module('dm_control._render')
-  except Exception as error:  # Each renderer has its own errors.
-    raise errors.RenderingError(_display.what_to_set(named, error)) from error
-
-
-def _candidates() -> list[str]:
-  named = os.environ.get('MUJOCO_GL')
-  if named:
-    return [named]
-  if sys.platform != 'linux':
-    return ['glfw']
-  return ['glfw', 'egl'] if _display.has_display() else ['egl']
 
 
 def problem_of(source: str, aim: str, env: Mapping[str, str]) -> str:

@@ -13,7 +13,6 @@ from realab_suite import errors
 from realab_suite.lab.experiments import requirements
 from realab_suite.launchers import flags
 from realab_suite.launchers import program
-from realab_suite.launchers import renderers
 
 flags.take(flags.IMPORT, flags.INPUT, flags.OUTPUT)
 
@@ -23,11 +22,10 @@ def main() -> None:
   folder = pathlib.Path(flags.required(flags.INPUT))
   if problem := requirements.missing('matplotlib', 'jinja2'):
     raise errors.SpecError(f'cannot write a report: {problem}')
-  renderers.render_on_demand()
+  flags.prepare()
   # Imports dm_control, so a renderer has to be chosen first.
   from realab_suite.reports import html_page
 
-  flags.load_imports()
   folder_name = flags.OUTPUT.value
   output = pathlib.Path(folder_name) if folder_name else folder
   path = html_page.write(folder, output, program.say)

@@ -19,7 +19,6 @@ from realab_suite import errors
 from realab_suite.lab.experiments import requirements
 from realab_suite.launchers import flags
 from realab_suite.launchers import program
-from realab_suite.launchers import renderers
 from realab_suite.launchers import sweep
 
 flags.take(flags.INPUT)
@@ -34,21 +33,16 @@ def main() -> None:
         '--input, --experiment: give one of them: folders with results,'
         ' or an experiment to run'
     )
-  if absl_flags.FLAGS[flags.INPUT.name].present > 1:
-    raise errors.SpecError(
-        '--input: given twice; give one list, such as --input=one,two'
-    )
   if problem := requirements.missing('matplotlib'):
     raise errors.SpecError(f'cannot write a scorecard: {problem}')
   if flags.EXPERIMENT.value:
     sweep.main()
     inputs = [pathlib.Path(flags.OUTPUT.value)]
-  renderers.render_on_demand()
+  flags.prepare()
   # Imports dm_control, so a renderer has to be chosen first.
   from realab_suite.reports import scorecard_pages
   from realab_suite.reports import scorecards
 
-  flags.load_imports()
   card = scorecards.make(inputs)
   output = pathlib.Path(flags.OUTPUT.value or inputs[0])
   program.say(scorecard_pages.write(card, output))

@@ -12,7 +12,6 @@ from realab_suite import errors
 from realab_suite.lab.verdicts import judging
 from realab_suite.launchers import flags
 from realab_suite.launchers import program
-from realab_suite.launchers import renderers
 
 # What the agent senses does not change what its readings are worth.
 _WORLD = [flag for flag in flags.WORLD if flag is not flags.SENSES]
@@ -21,12 +20,11 @@ flags.take(flags.IMPORT, *_WORLD)
 
 def main() -> None:
   """Prints the stakes of the design that the flags describe."""
-  renderers.render_on_demand()
+  flags.prepare()
   # Imports dm_control, so a renderer has to be chosen first.
   from realab_suite.lab.experiments import tables
   from realab_suite.lab.verdicts import stakes
 
-  flags.load_imports()
   world, design = flags.world(), flags.design()
   stake = judging.stakes_of(world, design)
   if stake is None:
@@ -35,17 +33,17 @@ def main() -> None:
         f' {judging.why_no_stakes(world, design)}'
     )
   rows = [
-      ['part of the objective', 'stake', 'more than', 'degenerate', 'confirmed']
+      {
+          'part of the objective': name,
+          'stake': f'{part.estimate:.4g} [{part.low:.4g}, {part.high:.4g}]',
+          'more than': part.than,
+          'degenerate': 'yes' if part.is_degenerate else 'no',
+          'confirmed': 'yes' if part.is_confirmed else 'no',
+      }
+      for name, part in stake.parts.items()
   ]
-  for name, part in stake.parts.items():
-    ends = f'{part.estimate:.4g} [{part.low:.4g}, {part.high:.4g}]'
-    answers = [
-        'yes' if is_so else 'no'
-        for is_so in (part.is_degenerate, part.is_confirmed)
-    ]
-    rows.append([name, ends, part.than, *answers])
   program.say(
-      f'{tables.markdown(rows)}\n\n{world.solver} in'
+      f'{tables.markdown(tables.frame(rows))}\n\n{world.solver} in'
       f' {world.domain}.{world.reference}, {stakes.NUM_EPISODES} episodes of'
       f' {world.max_steps} steps, with 95 % intervals; confirmed in'
       f' {world.domain}.{world.task}, whose median counts if it is clearly'

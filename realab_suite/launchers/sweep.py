@@ -15,7 +15,6 @@ from absl import flags as absl_flags
 from realab_suite.lab.experiments import threads
 from realab_suite.launchers import flags
 from realab_suite.launchers import program
-from realab_suite.launchers import renderers
 
 flags.take(flags.IMPORT, flags.EXPERIMENT, flags.OUTPUT)
 
@@ -54,7 +53,7 @@ def main() -> None:
   """Runs the sweep that the flags describe."""
   name, output = flags.required(flags.EXPERIMENT), flags.required(flags.OUTPUT)
   threads.use_one()
-  renderers.render_on_demand()
+  flags.prepare()
   # Imports numerical libraries, so the number of threads has to be set first.
   from realab_suite.lab.experiments import engines
   from realab_suite.lab.experiments import experiment_specs
@@ -63,7 +62,6 @@ def main() -> None:
   from realab_suite.lab.experiments import storage
   from realab_suite.lab.experiments import training
 
-  flags.load_imports()
   experiment = experiment_specs.load(name)
   if _ON_TASK.value is not None:
     experiment = experiment.on_task(_ON_TASK.value)

@@ -14,7 +14,6 @@ from absl import flags as absl_flags
 from realab_suite.lab.experiments import threads
 from realab_suite.launchers import flags
 from realab_suite.launchers import program
-from realab_suite.launchers import renderers
 
 flags.take(
     flags.IMPORT,
@@ -38,12 +37,11 @@ def main() -> None:
   )
   # NumPy and JAX read these settings once, when they are imported.
   threads.use_one()
-  renderers.render_on_demand()
+  flags.prepare()
   from realab_suite.lab.experiments import experiment_specs
   from realab_suite.lab.experiments import jobs
   from realab_suite.lab.experiments import training
 
-  flags.load_imports()
   [job] = jobs.plan(experiment_specs.load(name), [flags.SEED.value], [run])
   options = training.Options(program.say, _PARENT.value)
   training.run(job, pathlib.Path(output), options)

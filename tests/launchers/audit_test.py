@@ -1,7 +1,6 @@
 """Tests of the program that audits designs."""
 
 import json
-import shlex
 
 import pytest
 
@@ -50,20 +49,6 @@ def test_the_exit_status_of_the_program_is_the_verdict(
   # Progress, as the output is no terminal.
   assert lines[0].startswith('stakes: 0 of ')
   assert 'comparison: ' in ended.stdout
-
-
-def test_the_report_repeats_the_command(tmp_path):
-  output = tmp_path / 'audit'
-  ended = _run(
-      '--budget=20', '--seed=3', '--set=registers.reward.mass=2.5',
-      f'--output={output}',
-  )  # fmt: skip
-  [line] = [one for one in ended.stdout.splitlines() if 'repeat it' in one]
-  python, m, module, *words = shlex.split(line.partition(': ')[2])
-  assert [python, m, module] == ['python', '-m', audit.__name__]
-  again = in_process.run(audit, *words)
-  assert again.status == ended.status
-  assert again.stdout == ended.stdout.rpartition('Results')[0]
 
 
 @pytest.mark.parametrize(

@@ -13,12 +13,8 @@ from typing import Any
 import pytest
 
 import realab_suite
-from realab_suite.lab.experiments import experiment_specs
-from realab_suite.lab.experiments import requirements
 from realab_suite.launchers import command
-from realab_suite.launchers import demo
 from realab_suite.launchers import doctor
-from tests.launchers import in_process
 
 _ROOT = pathlib.Path(__file__).parents[2]
 
@@ -111,49 +107,7 @@ def test_the_version_is_printed(realab, capsys):
   assert capsys.readouterr().out == f'realab_suite {realab_suite.__version__}\n'
 
 
-def test_the_demo_of_the_makefile_ends_with_commands_that_can_be_run(
-    monkeypatch,
-):
-  ran: list[list[str]] = []
-
-  def run(arguments: list[str], check: bool) -> Any:
-    del check
-    ran.append(arguments[1:])
-    return subprocess.CompletedProcess(arguments, 0)
-
-  monkeypatch.setattr(subprocess, 'run', run)
-  ended = in_process.run(demo)
-  assert ended.status == 0
-  output = ran[1][2].removeprefix('--input=')
-  assert output.startswith('results/demo-')
-  assert '\t.venv/bin/realab demo\n' in (_ROOT / 'Makefile').read_text()
-  commands = re.findall('^  realab (.*)', ended.stdout, re.MULTILINE)
-  assert len(commands) == 3
-  for name, *arguments in map(str.split, commands):
-    module = importlib.import_module(f'realab_suite.launchers.{name}')
-    # Refused for the last argument alone.
-    assert "'and more'" in in_process.complaint(module, *arguments, 'and more')
-  assert len(experiment_specs.load('meter_only').seeds) == 5
-
-
-def test_a_demo_without_its_extras_is_refused_at_once(monkeypatch):
-  find = importlib.util.find_spec
-  monkeypatch.setattr(
-      'importlib.util.find_spec',
-      lambda name: None if name == 'optax' else find(name),
-  )
-  monkeypatch.delattr(subprocess, 'run')
-  assert in_process.complaint(demo) == (
-      'error: demo: optax not installed; run: python -m pip install -e'
-      " '.[agents,report]' -c constraints.txt, in the clone"
-  )
-
-
 # The doctor.
-
-
-def test_the_doctor_knows_every_extra():
-  assert set(doctor.EXTRAS) == set(_setup_cfg()['options.extras_require'])
 
 
 def _processes(monkeypatch: Any, status: int, stderr: str = '') -> None:
@@ -169,22 +123,17 @@ def _processes(monkeypatch: Any, status: int, stderr: str = '') -> None:
 def test_a_good_installation(monkeypatch, capsys):
   _processes(monkeypatch, 0)
   monkeypatch.setenv('MUJOCO_GL', 'egl')
-  monkeypatch.setattr(requirements, 'missing', lambda *_, extra: None)
   assert doctor.main() == 0
   shown = capsys.readouterr().out
   assert re.match(r'Python 3\.\d+\.\d+, realab-suite ', shown)
   assert 'ok  core       works' in shown
   assert 'ok  rendering  works with MUJOCO_GL=egl\n' in shown
-  assert 'ok  agents     installed, for learners\n' in shown
   assert 'to repair' not in shown
 
 
 def test_a_bad_installation(monkeypatch, capsys):
   _processes(monkeypatch, 1, 'Traceback\nImportError: no libmujoco\n')
   monkeypatch.setenv('MUJOCO_GL', 'egl')
-  monkeypatch.setitem(
-      doctor.EXTRAS, 'gym', doctor.Extra(('no_such_module',), 'curves')
-  )
   assert doctor.main() == 1
   shown = capsys.readouterr().out
   assert (
@@ -192,9 +141,6 @@ def test_a_bad_installation(monkeypatch, capsys):
   )
   assert '--  rendering  no camera works: MUJOCO_GL=egl (ImportError' in shown
   assert 'apt install libegl1' in shown
-  assert '--  gym        no_such_module not installed, for curves\n' in shown
-  repair = "python -m pip install -e '.[gym]' -c constraints.txt, in the clone"
-  assert f'to repair: {repair}\n' in shown
 
 
 def test_the_doctors_world_can_be_stepped():

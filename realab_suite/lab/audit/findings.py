@@ -284,12 +284,11 @@ def _typical(comparison: Comparison) -> int:
   return rows[order[len(order) // 2]].world
 
 
-def words(found: Audit, command: str) -> str:
+def words(found: Audit) -> str:
   """Returns a report of one screen.
 
   Args:
     found: The result.
-    command: Command that repeats the audit.
   """
   objective = ' + '.join(
       f'{weight:g} x {name}'
@@ -330,7 +329,6 @@ def words(found: Audit, command: str) -> str:
       f'Searched {found.num_searched} of {found.budget} episodes;'
       f' {intervals.counted(found.num_compared, "comparison")} in worlds that'
       ' the search has not seen.',
-      f'To repeat it: {command}',
       _advice(found),
   ]
   return '\n'.join(lines)

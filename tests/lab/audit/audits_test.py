@@ -58,13 +58,12 @@ def test_an_exploit_is_found_with_its_cost_and_contacts():
   assert str(moved).startswith('the base block of reward, ')
   assert 'held for' in str(moved)
   assert findings.Audit.model_validate_json(found.model_dump_json()) == found
-  lines = findings.words(found, 'repeat --it').splitlines()
+  lines = findings.words(found).splitlines()
   assert lines[0] == 'EXPLOITABLE'
   assert len(lines) < 24  # One screen.
   table = {line[:16].strip(): line[16:].split() for line in lines}
   assert table['hacked'] == '20 of 20 worlds 0 of 20 worlds'.split()
   assert any(line.startswith(f'Moved: {moved.block}, ') for line in lines)
-  assert 'To repeat it: repeat --it' in lines
   assert 'registers.reward.place' in lines[-1]
   assert 0 < found.num_searched <= found.budget == 60
   assert [phase for phase, _, _ in progress][:2] == ['stakes', 'search']
@@ -78,7 +77,7 @@ def test_ending_the_episode_by_a_switch_is_counted_by_itself():
   assert found.verdict == findings.EXPLOITABLE
   assert found.registers == ('switch',)
   assert found.of_plan.ended == found.of_plan.hacked > 0
-  assert 'Ended by a corrupted signal alone' in findings.words(found, '')
+  assert 'Ended by a corrupted signal alone' in findings.words(found)
 
 
 @pytest.mark.parametrize(
@@ -107,7 +106,7 @@ def test_designs_that_nothing_can_move_resist():
   assert found.registers == found.moved == ()
   assert found.of_plan == found.of_solver
   assert found.of_plan.hacked == found.of_plan.largest_gain == 0
-  text = findings.words(found, '')
+  text = findings.words(found)
   assert text.startswith('RESISTED WITHIN BUDGET\n')
   assert text.splitlines()[-1].startswith('Nothing can move the registers.')
 
@@ -118,7 +117,7 @@ def test_registers_out_of_reach_resist_and_the_budget_is_used():
   assert not found.is_sufficient
   assert 90 < found.num_searched <= found.budget
   assert found.of_plan.hacked == found.of_plan.largest_gain == 0
-  assert 'leave out --budget' in findings.words(found, '')
+  assert 'leave out --budget' in findings.words(found)
 
 
 def test_a_find_that_is_not_confirmed_does_not_end_the_search(monkeypatch):
@@ -128,7 +127,7 @@ def test_a_find_that_is_not_confirmed_does_not_end_the_search(monkeypatch):
   found = _audit('instantaneous_reward', max_steps=30, budget=440)
   assert found.verdict == findings.UNDECIDED
   assert 'the plan gains more than the solver and earns less' in found.reasons
-  lines = findings.words(found, '').splitlines()
+  lines = findings.words(found).splitlines()
   assert lines[:2] == ['UNDECIDED', f'* {found.reasons[0]}']
   assert lines[-1].startswith('No exploit was found, but')
   assert 400 < found.num_searched <= found.budget
