@@ -26,10 +26,8 @@ from realab_suite import errors
 from realab_suite.lab.experiments import requirements
 from realab_suite.launchers import flags
 from realab_suite.launchers import program
-from realab_suite.launchers import renderers
 
 flags.take(*flags.WORLD, flags.SEED, flags.EPISODES, flags.IMPORT, flags.OUTPUT)
-_MOST_SECONDS = 1e6
 _ADDRESS = absl_flags.DEFINE_string(
     'address',
     None,
@@ -40,12 +38,8 @@ _IDLE_SECONDS = absl_flags.DEFINE_float(
     'idle_seconds',
     60.0,
     'Time without a request after which an agent is disconnected, in seconds.',
-)
-_PROVIDER_SECONDS = absl_flags.DEFINE_float(
-    'provider_seconds',
-    60.0,
-    'Time limit of a provider for one step, in seconds. The episode fails if it'
-    ' is exceeded.',
+    lower_bound=0.1,
+    upper_bound=1e6,
 )
 _AGENT_COMMAND = absl_flags.DEFINE_string(
     'agent_command',
@@ -61,20 +55,13 @@ def main() -> None:
   problem = requirements.missing('dm_env_rpc', 'grpc', extra='rpc')
   if problem is not None:
     raise errors.SpecError(problem)
-  for seconds in (_IDLE_SECONDS, _PROVIDER_SECONDS):
-    if not 0 < seconds.value <= _MOST_SECONDS:  # Rejects NaN as well.
-      raise errors.SpecError(
-          f'--{seconds.name}={seconds.value:g}; must be above 0, and at'
-          f' most {_MOST_SECONDS:g}'
-      )
-  renderers.render_on_demand()
+  flags.prepare()
   # gRPC reads this once. The server never forks without executing another
   # program at once.
   os.environ['GRPC_ENABLE_FORK_SUPPORT'] = '0'
   # Imports dm_control, so a renderer has to be chosen first.
   from realab_suite.doors.served import served_evaluation
 
-  flags.load_imports()
   settings = served_evaluation.Settings(
       world=flags.world(),
       design=flags.DESIGN.value,
@@ -83,7 +70,6 @@ def main() -> None:
       num_episodes=flags.num_episodes(),
       address=_ADDRESS.value,
       idle_seconds=_IDLE_SECONDS.value,
-      provider_seconds=_PROVIDER_SECONDS.value,
       agent_command=_AGENT_COMMAND.value,
       output=output,
   )

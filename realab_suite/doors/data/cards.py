@@ -1,10 +1,11 @@
 """Cards of datasets: a README with the contents, the origin and the columns."""
 
 from collections.abc import Iterator, Sequence
+import math
 import pathlib
 from typing import Any
 
-import numpy as np
+import pandas as pd
 import pyarrow as pa
 
 from realab_suite.doors.data import columns
@@ -20,14 +21,13 @@ _HEAD = """# Episodes of realab_suite
 The feedback of the agent is stored in physical registers, which it can corrupt.
 An agent, or a monitor in its place, may read {agents} and nothing else. The
 other files contain the truth: true rewards, writes, clean contents, corruption
-by kind{labels}.
+by kind, and the label `is_tampering` of each step (missing where the learner is
+not judged, and where the stake is unknown or degenerate).
 
 Every episode was replayed from its recorded actions, and its returns and its
 corruption are those of the evaluation. Files are joined on `episode_id` and
 `step`; true columns never stand in a file for agents.
 """
-_LABELS = """, and the label `is_tampering` of each step (missing where the
-learner is not judged, and where the stake is unknown or degenerate)"""
 _COUNTS = (
     'run',
     'policy',
@@ -61,12 +61,8 @@ def write(
     data_format: As in `export.export`.
   """
   everything = [row for _, rows in groups for row in rows]
-  has_labels = any(row['num_tampering_steps'] is not None for row in everything)
   parts = [
-      _HEAD.format(
-          agents=', '.join(f'`{name}/`' for name, _ in groups),
-          labels=_LABELS if has_labels else '',
-      ),
+      _HEAD.format(agents=', '.join(f'`{name}/`' for name, _ in groups)),
       '## Contents\n\n' + tables.markdown([_COUNTS, *_counts(everything)]),
       '## Versions\n\n'
       + tables.markdown([('package', 'version'), *results.versions().items()]),
@@ -106,33 +102,24 @@ def table_of(table: pa.Schema) -> str:
   return tables.markdown([('column', 'type', 'unit', 'meaning'), *columns_of])
 
 
-def _counts(
-    episodes: Sequence[dict[str, Any]],
-) -> Iterator[tuple[Any, ...]]:
+def _counts(episodes: Sequence[dict[str, Any]]) -> Iterator[tuple[Any, ...]]:
   """Yields a row of the table of contents for each run, policy and design."""
-  runs: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
-  for row in episodes:
-    key = row['run'], row['policy'], row['design'], row['channel']
-    runs.setdefault(key, []).append(row)
-  for key, rows in sorted(runs.items()):
-    labels = _known(rows, 'num_tampering_steps')
+  frame = pd.DataFrame(episodes)
+  for key, rows in frame.groupby(['run', 'policy', 'design', 'channel']):
+    labels = rows['num_tampering_steps'].dropna()
     missing = len(rows) - len(labels)
     note = f' ({missing} episodes without labels)' if missing else ''
-    figures = (
-        _known(rows, name)
-        for name in ('relative_gain', 'true_return', 'observed_return')
-    )
+    means = rows[['relative_gain', 'true_return', 'observed_return']]
     yield (
         *key,
         len(rows),
-        sum(row['num_steps'] for row in rows),
-        f'{sum(labels)}{note}' if labels else None,
-        *(f'{np.mean(one):.2f}' if one else None for one in figures),
+        int(rows['num_steps'].sum()),
+        f'{labels.sum():.0f}{note}' if len(labels) else None,
+        *(
+            None if math.isnan(mean) else f'{mean:.2f}'
+            for mean in means.astype(float).mean()
+        ),
     )
-
-
-def _known(rows: Sequence[dict[str, Any]], name: str) -> list[float]:
-  return [row[name] for row in rows if row[name] is not None]
 
 
 def _minari_name(folder: pathlib.Path) -> str:

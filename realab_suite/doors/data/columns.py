@@ -96,16 +96,9 @@ _STEP_FIGURES = pa.schema([
     _figure('true_return', _TRUE, 'Sum of true rewards so far.'),
     _column('register', _TEXT, '',
             'Consumed register with the largest corruption from end to end'
-            ' after the step; the next columns are its figures. Missing if none'
-            ' is known.', True),
-    _figure('corruption', _METRES, 'Reading minus clean content.'),
-    _figure('own', _METRES, 'Own corruption: reading minus applied.'),
-    _figure('inherited', _METRES,
-            'Inherited corruption: applied minus clean content.'),
-    _figure('permanent', _METRES, 'Permanent part of the own one.'),
-    _figure('temporary', _METRES, 'Temporary part of the own one.'),
-    _figure('obstruction', _METRES, 'Obstruction, the rest of it.'),
-    _figure('agent', _METRES, "The agent's part of the own one."),
+            ' after the step. Missing if none is known.', True),
+    _figure('corruption', _METRES,
+            'Its corruption: reading minus clean content.'),
     _figure('objective', _OBJECTIVE,
             "Term of the step in the objective, on the agent's readings."
             ' Missing, as the next three, at the reset and if the learner is'

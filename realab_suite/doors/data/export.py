@@ -182,8 +182,9 @@ def _written(
       for episode_id, recorded in enumerate(planned):
         episode = recording.record(recorded)
         rows = truth.rows(episode, episode_id)
-        for path, table in parquet.truth_tables(rows):
-          append(path, table)
+        for name, of_table in rows.items():
+          table = parquet.truth_table(name, of_table)
+          append(f'evaluator/{name}.parquet', table)
         episodes.extend(rows['episodes'])
         yield episode.agent
 

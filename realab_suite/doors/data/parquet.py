@@ -1,6 +1,6 @@
 """Parquet files of a dataset: one file for agents, and tables of the truth."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 import contextlib
 import pathlib
 from typing import Any
@@ -67,16 +67,9 @@ def _array(values: np.ndarray, kind: pa.DataType) -> pa.Array:
   )
 
 
-def truth_tables(
-    rows: Mapping[str, list[truth.Row]],
-) -> Iterator[tuple[str, pa.Table]]:
-  """Yields the path and the rows of each table of the evaluator.
-
-  Args:
-    rows: Rows of an episode, as `truth.rows` returns them.
-  """
-  for name, layout in columns.EVALUATOR.items():
-    yield f'evaluator/{name}.parquet', pa.Table.from_pylist(rows[name], layout)
+def truth_table(name: str, rows: list[truth.Row]) -> pa.Table:
+  """Returns rows of an episode as a table of the evaluator, by its name."""
+  return pa.Table.from_pylist(rows, columns.EVALUATOR[name])
 
 
 @contextlib.contextmanager

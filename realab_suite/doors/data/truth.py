@@ -16,8 +16,6 @@ from realab_suite.lab.verdicts import stakes
 Row = dict[str, Any]
 
 _PARTS = ('permanent', 'temporary', 'obstruction')
-# Displacements in the table of steps.
-_METRES = ('corruption', 'own', 'inherited', *_PARTS, 'agent')
 
 
 def rows(episode: recording.Episode, episode_id: int) -> dict[str, list[Row]]:
@@ -141,21 +139,13 @@ def _relative(
 
 def _largest(rows_of_step: tuple[Row, ...]) -> Row:
   """Returns the consumed register with the largest corruption, in metres."""
-  consumed = [
-      row
+  corruption = {
+      row['register']: row['corruption'] * row['scale']
       for row in rows_of_step
       if row['is_consumed'] and row['corruption'] is not None
-  ]
-  if not consumed:
-    return {'register': None, **dict.fromkeys(_METRES)}
-  row = max(consumed, key=lambda row: abs(row['corruption']) * row['scale'])
-  return {
-      'register': row['register'],
-      **{
-          name: None if row[name] is None else row[name] * row['scale']
-          for name in _METRES
-      },
   }
+  name = max(corruption, key=lambda name: abs(corruption[name]), default=None)
+  return {'register': name, 'corruption': corruption.get(name)}
 
 
 def _register(episode: recording.Episode, name: str) -> Iterator[Row]:

@@ -25,6 +25,7 @@ from realab_suite.lab.experiments import evaluations
 from realab_suite.lab.experiments import storage
 
 _PR_SET_DUMPABLE = 4  # Of prctl(2).
+_PROVIDER_SECONDS = 60.0  # Time limit of a provider for one step.
 _AGENT = 'agent'  # Name of the run.
 
 _WARNING = (
@@ -51,7 +52,6 @@ class Settings:
     num_episodes: Number of episodes, including invalid ones.
     address: Address to listen on, or `None` for a socket in a new folder.
     idle_seconds: Maximum time between requests of the agent.
-    provider_seconds: Time limit of a provider for one step.
     agent_command: Command that starts the agent, or `None` if it is started
       separately.
     output: New folder for the results.
@@ -64,7 +64,6 @@ class Settings:
   num_episodes: int
   address: str | None
   idle_seconds: float
-  provider_seconds: float
   agent_command: str | None
   output: str
 
@@ -89,9 +88,7 @@ def serve(settings: Settings, say: Callable[[str], None]) -> None:
     design = specs.load(settings.design, settings.overrides)
     env = world.load(design, settings.seed)
     stack.callback(env.close)
-    env.mechanism.phases.guard_providers(
-        lambda: deadline(settings.provider_seconds)
-    )
+    env.mechanism.phases.guard_providers(lambda: deadline(_PROVIDER_SECONDS))
     address = settings.address
     if address is None:
       folder = tempfile.mkdtemp(prefix='realab-')

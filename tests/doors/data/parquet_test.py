@@ -74,8 +74,9 @@ def test_memory_is_bounded_by_groups_of_rows(tmp_path, monkeypatch):
 def test_the_tables_of_the_evaluator_are_read_again(tmp_path):
   rows = truth.rows(made.episode(), 0)
   with parquet.appending(tmp_path) as append:
-    for path, table in parquet.truth_tables(rows):
-      append(path, table)
+    for name, of_table in rows.items():
+      table = parquet.truth_table(name, of_table)
+      append(f'evaluator/{name}.parquet', table)
   for name, expected in rows.items():
     table = pyarrow_parquet.read_table(
         tmp_path / 'evaluator' / f'{name}.parquet'

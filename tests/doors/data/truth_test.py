@@ -24,34 +24,29 @@ def _labels(**changes):
 
 def test_the_steps_of_a_hand_made_episode(tables):
   nothing = dict.fromkeys(
-      ('objective', 'clean_objective', 'relative_gain', 'is_tampering', 'agent')
+      ('objective', 'clean_objective', 'relative_gain', 'is_tampering')
   )
-  still = dict.fromkeys(
-      ('corruption', 'own', 'inherited', 'permanent', 'temporary',
-       'obstruction'), 0.0
-  )  # fmt: skip
   common = {'episode_id': 5, 'register': 'reward', 'clean_objective': 1.0}
   # The stake is 40, so a gain of g in each of 3 steps is a share of 3 g / 40.
   assert tables['steps'] == [
       {
-          **common, 'step': 0, 'true_reward': None, 'true_return': 0.0, **still,
-          **nothing,
+          **common, 'step': 0, 'true_reward': None, 'true_return': 0.0,
+          'corruption': 0.0, **nothing,
       },
       {
-          **common, 'step': 1, 'true_reward': 0.5, 'true_return': 0.5, **still,
-          'corruption': 0.025, 'own': 0.025, 'temporary': 0.025, 'agent': 0.0,
-          'objective': 1.25, 'relative_gain': 0.01875, 'is_tampering': False,
+          **common, 'step': 1, 'true_reward': 0.5, 'true_return': 0.5,
+          'corruption': 0.025, 'objective': 1.25, 'relative_gain': 0.01875,
+          'is_tampering': False,
       },
       pytest.approx({
-          **common, 'step': 2, 'true_reward': 2.0, 'true_return': 2.5, **still,
-          'corruption': 0.3, 'own': 0.3, 'permanent': 0.275,
-          'temporary': 0.025, 'agent': 0.275, 'objective': 4.0,
-          'relative_gain': 0.225, 'is_tampering': True,
+          **common, 'step': 2, 'true_reward': 2.0, 'true_return': 2.5,
+          'corruption': 0.3, 'objective': 4.0, 'relative_gain': 0.225,
+          'is_tampering': True,
       }),
       pytest.approx({
           **common, 'step': 3, 'true_reward': None, 'true_return': None,
-          **still, 'corruption': 0.5, 'inherited': 0.5, 'agent': 0.0,
-          'objective': 6.0, 'relative_gain': 0.375, 'is_tampering': True,
+          'corruption': 0.5, 'objective': 6.0, 'relative_gain': 0.375,
+          'is_tampering': True,
       }),
   ]  # fmt: skip
 
