@@ -11,12 +11,13 @@ from realab_suite import policies
 from realab_suite import suite
 from realab_suite.config import messages
 from realab_suite.engine import batch_environment
+from realab_suite.engine import batch_time_steps
 from realab_suite.engine import environment
 from realab_suite.entities import protocols
 from realab_suite.evaluation import actors
+from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import ledgers
-from realab_suite.evaluation import results
 from realab_suite.feedback import specs
 from realab_suite.policies import action_sets
 from realab_suite.tasks import base
@@ -39,7 +40,8 @@ def check_world(
   - Its members have the types and shapes that `tasks.base.Task` demands.
   - Its solver earns more than random actions, and neither earns more than
     `max_true_return`. It is a function that serves whole batches. A second
-    call of `latch_events` pays nothing.
+    call of `latch_events` pays nothing. No run can show that `max_true_return`
+    is too high.
   - Observations match their spec, the reward is always 0.0, and the true
     rewards sum to the score, which is at most `max_true_return`.
   - An episode depends on the seed, its number and the actions, and on nothing
@@ -67,22 +69,24 @@ def check_world(
   with contextlib.closing(load(max_steps)) as env:
     _check_members(env)
     _check_hooks(env)
-    taken = _check_solver(env)
+    solver = _solver_of(env.task)
     plans = [_actions(env, world) for world in range(_NUM_ENVS)]
-    plans[0][: len(taken)] = taken
-  steps = max_steps if len(taken) else min(num_steps, max_steps)
+    if solver is not None:
+      taken = _check_solver(env, solver)
+      plans[0][: len(taken)] = taken
+  steps = min(num_steps, max_steps) if solver is None else max_steps
   alone = []
   for world in range(_NUM_ENVS):
     with contextlib.closing(load(steps, world)) as env:
       # Others than world 0 are compared with one episode of a batch.
       number = 1 if world else _NUM_EPISODES
-      alone.append(_episodes(env, plans[world], number))
+      alone.append(_episodes(env, plans[world], number, solver))
       if not world:
         _check_rewards(env, alone[0])
         _check_continuations(env, alone[0], plans[0])
   with contextlib.closing(load(steps)) as env:
     try:
-      _check_batch(env, alone, np.stack(plans, axis=1)[:steps])
+      _check_batch(env, alone, np.stack(plans, axis=1)[:steps], solver)
     except ValueError as error:
       contracts.require(
           'truth value' not in str(error),
@@ -100,10 +104,12 @@ class _Moment(NamedTuple):
     arrays: Observation of the agent, type and discount of the step, true
       reward, facts and measurements.
     reward: The constant reward, or `None` in the first step.
+    choice: Action that the solver would take, or `None`.
   """
 
   arrays: Mapping[str, np.ndarray]
   reward: Any
+  choice: Any = None
 
 
 def _check_members(env: environment.Environment) -> None:
@@ -187,14 +193,22 @@ def _figures(
 
 
 def _episodes(
-    env: environment.Environment, actions: np.ndarray, number: int
+    env: environment.Environment,
+    actions: np.ndarray,
+    number: int,
+    solver: policies.Policy | None,
 ) -> list[list[_Moment]]:
   """Returns the moments of the next episodes of one world."""
   ledger = ledgers.Ledger()
   env.add_sink(ledger)
-  episodes = [
-      [*_moments(env, ledger, env.reset(), actions)] for _ in range(number)
-  ]
+  episodes = []
+  for episode in range(number):
+    actor = None
+    if solver is not None:
+      actor = actors.make(solver, env)
+      actor.begin(episode)
+    moments = _moments(env, ledger, env.reset(), actions, actor)
+    episodes.append([*moments])
   env.remove_sink(ledger)
   return episodes
 
@@ -204,14 +218,19 @@ def _moments(
     ledger: ledgers.Ledger,
     time_step: dm_env.TimeStep,
     actions: np.ndarray,
+    actor: actors.Actor | None = None,
 ) -> Iterator[_Moment]:
   """Yields the moments of an episode, from a time step on."""
-  yield _moment(env, time_step, ledger)
   for action in actions:
+    moment = _moment(env, time_step, ledger)
     if time_step.last():
+      yield moment
       return
+    if actor is not None:
+      moment = moment._replace(choice=actor.act(time_step))
+    yield moment
     time_step = env.step(action)
-    yield _moment(env, time_step, ledger)
+  yield _moment(env, time_step, ledger)
 
 
 def _moment(
@@ -312,6 +331,7 @@ def _check_batch(
     env: environment.Environment,
     alone: list[list[list[_Moment]]],
     actions: np.ndarray,
+    solver: policies.Policy | None,
 ) -> None:
   """Checks that worlds of a batch equal single worlds."""
   name = type(env.task).__name__
@@ -320,26 +340,36 @@ def _check_batch(
       batch_environment.BatchEnvironment(env, _NUM_ENVS, 1)
   ) as batch:
     batch.add_sink(ledger)
+    # The second one notices what a policy remembers of the first one's calls.
+    twins = solver and [
+        batch_actors.BatchPolicyActor(solver, batch, _SEED) for _ in range(2)
+    ]
     time_step = batch.reset()
     for number in range(len(actions)):
+      moments = {
+          world: episodes[0][number]
+          for world, episodes in enumerate(alone)
+          if number < len(episodes[0])
+      }
       figures = _figures(env.task, batch.physics, (_NUM_ENVS,))
-      for world, episodes in enumerate(alone):
-        if number < len(episodes[0]):
-          arrays = {
-              'step_type': np.asarray(int(time_step.step_type[world])),
-              'discount': np.asarray(time_step.discount[world]),
-          }
-          for key, value in {**time_step.observation, **figures}.items():
-            arrays[key] = value[world]
-          expected = {**episodes[0][number].arrays}
-          del expected['true_reward']
-          contracts.require_same(
-              arrays,
-              expected,
-              f'{name}: world {world} of a batch differs from a single world'
-              f' in step {number}; index trailing axes and write whole'
-              ' attributes',
-          )
+      for world, moment in moments.items():
+        arrays = {
+            'step_type': np.asarray(int(time_step.step_type[world])),
+            'discount': np.asarray(time_step.discount[world]),
+        }
+        for key, value in {**time_step.observation, **figures}.items():
+          arrays[key] = value[world]
+        expected = {**moment.arrays}
+        del expected['true_reward']
+        contracts.require_same(
+            arrays,
+            expected,
+            f'{name}: world {world} of a batch differs from a single world'
+            f' in step {number}; index trailing axes and write whole'
+            ' attributes',
+        )
+      for actor in twins or ():
+        _check_choices(env.task, actor, time_step, moments)
       time_step = batch.step(actions[number])
     for world, episodes in enumerate(alone):
       rewards = [float(one.arrays['true_reward']) for one in episodes[0][1:]]
@@ -349,6 +379,30 @@ def _check_batch(
           f'{name}: world {world} of a batch differs from a single world in its'
           f' true rewards, {found_rewards} instead of {rewards}',
       )
+
+
+def _check_choices(
+    task: base.Task,
+    actor: batch_actors.BatchActor,
+    time_step: batch_time_steps.BatchTimeStep,
+    moments: Mapping[int, _Moment],
+) -> None:
+  """Checks that a solver acts in a batch as in these worlds alone."""
+  where = f'{type(task).__name__}.SOLVER: {task.SOLVER!r}'
+  try:
+    choices = actor.act(time_step)
+  except Exception as error:  # Policies may raise any class.
+    raise contracts.ContractError(
+        f'{where}: {messages.exception(error)}: in a batch, numbers are'
+        ' arrays with an axis of worlds; use np.where instead of if'
+    ) from error
+  for world, moment in moments.items():
+    contracts.require(
+        moment.choice is None or np.array_equal(choices[world], moment.choice),
+        f'{where}: chose {choices[world]} in world {world} of a batch, and'
+        f' {moment.choice} in this world alone; index trailing axes, and keep'
+        ' what it remembers in the state',
+    )
 
 
 def _compare(
@@ -362,126 +416,51 @@ def _compare(
     contracts.require_same(moment.arrays, expected_moment.arrays, breach)
 
 
-def _check_solver(env: environment.Environment) -> np.ndarray:
+def _solver_of(task: base.Task) -> policies.Policy | None:
+  """Returns the solver of a task in which there is something to earn."""
+  if task.SOLVER is None or not task.max_true_return:
+    return None
+  return policies.make(task.SOLVER)
+
+
+def _check_solver(
+    env: environment.Environment, solver: policies.Policy
+) -> np.ndarray:
   """Checks that the solver earns more than random actions.
 
   Returns:
-    The actions of its first episode, `(steps, *action_spec.shape)`, without
-    steps if there is no solver.
+    The actions of its first episode, `(steps, *action_spec.shape)`.
   """
   task: base.Task = env.task
-  if task.SOLVER is None or not task.max_true_return:
-    return _actions(env, 0)[:0]
-  returns: list[float] = []
-  taken: list[list[np.ndarray]] = []
-  for name in (task.SOLVER, 'random'):
-    recorders = [_Recorder(policies.make(name)) for _ in range(_NUM_EPISODES)]
-    rows = [_play(env, one, k, taken) for k, one in enumerate(recorders)]
-    if name == task.SOLVER:
-      _check_steps(f'{type(task).__name__}.SOLVER: {name!r}', recorders)
-    returns.append(float(np.mean([row.true_return for row in rows])))
-    largest = max(row.true_return for row in rows)
+  means, taken = [], []
+  for name, policy in (
+      (task.SOLVER, solver),
+      ('random', policies.make('random')),
+  ):
+    plays = [_play(env, policy, episode) for episode in range(_NUM_EPISODES)]
+    taken.append(plays[0][1])
+    returns = [true_return for true_return, _ in plays]
+    means.append(float(np.mean(returns)))
     contracts.require(
-        largest <= task.max_true_return + 1e-9,
-        f'{type(task).__name__}: {name!r} earns {largest}; max_true_return is'
-        f' {task.max_true_return}',
+        max(returns) <= task.max_true_return + 1e-9,
+        f'{type(task).__name__}: {name!r} earns {max(returns)};'
+        f' max_true_return is {task.max_true_return}',
     )
   contracts.require(
-      returns[0] > returns[1],
-      f'{type(task).__name__}.SOLVER: {task.SOLVER!r} earns {returns[0]:.3g}'
-      f' per episode, and random actions {returns[1]:.3g}',
+      means[0] > means[1],
+      f'{type(task).__name__}.SOLVER: {task.SOLVER!r} earns {means[0]:.3g}'
+      f' per episode, and random actions {means[1]:.3g}',
   )
   return np.array(taken[0])
 
 
-@final
-class _Recorder(policies.Policy):
-  """Policy that acts like another one and keeps its inputs and actions."""
-
-  def __init__(self, policy: policies.Policy) -> None:
-    self.policy = policy
-    self.steps: list[tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]] = []
-    self.choices: list[int] = []
-
-  @property
-  def action_set(self) -> action_sets.ActionSet:
-    return self.policy.action_set
-
-  @property
-  def required_senses(self) -> tuple[str, ...]:
-    return self.policy.required_senses
-
-  @property
-  def privileged_senses(self) -> tuple[str, ...]:
-    return self.policy.privileged_senses
-
-  def in_action_set(self, action_set: action_sets.ActionSet) -> policies.Policy:
-    self.policy = self.policy.in_action_set(action_set)
-    return self
-
-  def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
-    return self.policy.initial_state(batch_shape)
-
-  def step(
-      self,
-      observation: Mapping[str, np.ndarray],
-      episode_start: np.ndarray,
-      key: np.ndarray,
-      state: Any,
-  ) -> tuple[np.ndarray, Any]:
-    arrays = {name: np.array(value) for name, value in observation.items()}
-    self.steps.append((arrays, np.array(episode_start), np.array(key)))
-    choice, state = self.policy.step(observation, episode_start, key, state)
-    self.choices.append(int(choice))
-    return choice, state
-
-
-def _check_steps(where: str, recorders: list[_Recorder]) -> None:
-  """Checks that a policy is a function that serves a batch of episodes."""
-  policy = recorders[0].policy
-  state = policy.initial_state((len(recorders),))
-  for number in range(max(len(one.steps) for one in recorders)):
-    # An episode that is over repeats its last step.
-    lasts = [min(number, len(one.steps) - 1) for one in recorders]
-    observations, starts, keys = zip(
-        *(one.steps[k] for one, k in zip(recorders, lasts, strict=True)),
-        strict=True,
-    )
-    batch = {
-        name: np.stack([one[name] for one in observations])
-        for name in observations[0]
-    }
-    expected = [one.choices[k] for one, k in zip(recorders, lasts, strict=True)]
-    is_over = [k < number for k in lasts]
-    inputs = batch, np.stack(starts), np.stack(keys), state
-    for _ in range(2):
-      try:
-        choices, state = policy.step(*inputs)
-      except Exception as error:  # Policies may raise any class.
-        raise contracts.ContractError(
-            f'{where}: {messages.exception(error)}: in a batch, numbers are'
-            ' arrays with an axis of worlds; use np.where instead of if'
-        ) from error
-      contracts.require(
-          np.shape(choices) == (len(recorders),)
-          and np.all(is_over | (choices == np.array(expected))),
-          f'{where}: chose {choices} in a batch in step {number}, and'
-          f' {expected} in these worlds alone; index trailing axes, and'
-          ' keep what it remembers in the state',
-      )
-
-
 def _play(
-    env: environment.Environment,
-    policy: policies.Policy,
-    episode: int,
-    taken: list[list[np.ndarray]],
-) -> results.EpisodeResult:
-  """Plays an episode with a policy, and adds the list of its actions."""
+    env: environment.Environment, policy: policies.Policy, episode: int
+) -> tuple[float, list[np.ndarray]]:
+  """Returns the true return of an episode of a policy, and its actions."""
   actor = actors.make(policy, env)
   actor.begin(episode)
   actions: list[np.ndarray] = []
-  taken.append(actions)
 
   def act(time_step: dm_env.TimeStep) -> np.ndarray:
     if not time_step.first():
@@ -491,7 +470,7 @@ def _play(
 
   [result] = evaluate.evaluate(env, act, 1, first_episode=episode)
   _latch_again(env)
-  return result
+  return result.true_return, actions
 
 
 def _latch_again(env: environment.Environment) -> None:

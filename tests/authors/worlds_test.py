@@ -240,7 +240,7 @@ class _Walk(_Plain):
     [
         (_Walker, None),
         (_Branching, 'use np.where instead of if'),
-        (_Counting, 'in these worlds alone'),
+        (_Counting, 'in this world alone'),
     ],
 )
 def test_a_solver_is_a_function_that_serves_batches(
