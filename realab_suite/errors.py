@@ -47,11 +47,6 @@ class ClosedError(RealabError, RuntimeError):
 
 
 @final
-class EpisodeError(RealabError, RuntimeError):
-  """A step was requested after a failure; the environment has to be reset."""
-
-
-@final
 class WorldError(RealabError, RuntimeError):
   """A failure in a world; the details are only in the evaluator's result."""
 

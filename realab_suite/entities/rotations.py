@@ -1,19 +1,10 @@
-"""Rotations of vectors and quaternions, most of them about the vertical."""
+"""Rotations about the vertical, and quaternions."""
 
 from typing import Any
 
 import numpy as np
 
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
-
-
-def rotate(vector: np.ndarray, angle: float) -> np.ndarray:
-  """Rotates vectors, `(..., 3)`, about the vertical by an angle in rad."""
-  if not angle:
-    return vector
-  cos, sin = np.cos(angle), np.sin(angle)
-  x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
-  return np.stack([cos * x - sin * y, sin * x + cos * y, z], axis=-1)
 
 
 def matrices(quaternion: np.ndarray) -> np.ndarray:

@@ -4,10 +4,11 @@ A ledger is an event sink of the engine. Agents and providers can neither read
 it nor write to it.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+import collections
+from collections.abc import Iterable, Sequence
 import dataclasses
 import math
-from typing import Any, NamedTuple, final
+from typing import Any, final
 
 import numpy as np
 
@@ -118,53 +119,73 @@ class Ledger(events.EventSink):
 
   def episode_ended(self, end: events.End) -> None:
     # A sink that was added in mid-episode receives only the end of the episode.
-    if self._episodes and self.last.end is None:
+    if self._is_running:
       self.last.end = end
+
+  def add_world(self, step: events.BatchStep, world: int) -> None:
+    """Adds a control step of one world of a batch.
+
+    Args:
+      step: Control step of the batch.
+      world: Index of the world in the batch.
+    """
+    if step.is_first[world]:
+      seed, number, episode_number = (
+          int(numbers[world])
+          for numbers in (step.seed, step.world, step.episode)
+      )
+      episode = EpisodeLedger(seed, number, episode_number, {}, [])
+      episode.add([*step.initial, *step.agent_reads], world)
+      self._episodes.append(episode)
+    elif not step.has_failed[world] and self._is_running:
+      self.last.add_reward(float(step.true_reward[world]), step.failure)
+      self.last.add([*step.records, *step.agent_reads], world)
+    if world in step.ends:
+      self.episode_ended(step.ends[world])
+
+  @property
+  def _is_running(self) -> bool:
+    """False before the first episode and after the end of the last one."""
+    return bool(self._episodes) and self.last.end is None
 
   def state(self) -> Any:
     """Returns the running episode as plain data; `None` if there is none."""
-    return _state_of(self._episodes[-1] if self._episodes else None)
+    if not self._is_running:
+      return None
+    episode = self.last
+    return {
+        'seed': int(episode.seed),
+        'world': episode.world,
+        'episode': episode.episode,
+        'entries': {
+            register: _columns(entries)
+            for register, entries in episode.entries.items()
+        },
+        'true_rewards': np.array(episode.true_rewards),
+        'failure': episode.failure,
+    }
 
   def set_state(self, state: Any) -> None:
     """Adds a saved episode and continues it.
 
     Episodes that are already in the ledger stay in it.
     """
-    if state is not None:
-      self._episodes.append(_from_state(state))
-
-
-def _state_of(episode: EpisodeLedger | None) -> Any:
-  """Returns an episode as plain data, or `None` if it is not running."""
-  if episode is None or episode.end is not None:
-    return None
-  return {
-      'seed': int(episode.seed),
-      'world': episode.world,
-      'episode': episode.episode,
-      'entries': {
-          register: _columns(entries)
-          for register, entries in episode.entries.items()
-      },
-      'true_rewards': np.array(episode.true_rewards),
-      'failure': episode.failure,
-  }
-
-
-def _from_state(state: Any) -> EpisodeLedger:
-  """Returns the episode of a state; the inverse of `_state_of`."""
-  entries = {
-      register: _entries(register, columns)
-      for register, columns in state['entries'].items()
-  }
-  return EpisodeLedger(
-      state['seed'],
-      state['world'],
-      state['episode'],
-      entries,
-      state['true_rewards'].tolist(),
-      failure=state['failure'],
-  )
+    if state is None:
+      return
+    entries = {
+        register: _entries(register, columns)
+        for register, columns in state['entries'].items()
+    }
+    self._episodes.append(
+        EpisodeLedger(
+            state['seed'],
+            state['world'],
+            state['episode'],
+            entries,
+            state['true_rewards'].tolist(),
+            failure=state['failure'],
+        )
+    )
 
 
 def _columns(entries: list[registers.Record]) -> tuple[np.ndarray, ...]:
@@ -194,22 +215,15 @@ def _entries(
 
 
 @final
-class _Restored(NamedTuple):
-  """Saved states that worlds continued from, by index in the batch."""
-
-  states: Mapping[int, Any]
-
-
-@final
 class BatchLedger(events.BatchEventSink):
   """Records the ledgers of all episodes of a batch.
 
-  A step costs one append, independently of the number of worlds. `episodes`
-  assembles the ledgers of a world when it is called.
+  A step costs one append. Each world gets its part when a ledger is asked for.
   """
 
   def __init__(self) -> None:
-    self._log: list[events.BatchStep | _Restored] = []
+    self._ledgers: dict[int, Ledger] = collections.defaultdict(Ledger)
+    self._steps: list[events.BatchStep] = []
 
   @property
   def state_kind(self) -> str:
@@ -217,7 +231,7 @@ class BatchLedger(events.BatchEventSink):
     return Ledger.__name__
 
   def step_ended(self, step: events.BatchStep) -> None:
-    self._log.append(step)
+    self._steps.append(step)
 
   def episodes(self, world: int) -> list[EpisodeLedger]:
     """Returns the episodes of a world, including the one that is running.
@@ -225,66 +239,24 @@ class BatchLedger(events.BatchEventSink):
     Args:
       world: Index of the world in the batch.
     """
-    return _episodes_of(world, self._log)
+    return self._ledger(world).episodes
 
   def state(self, indices: np.ndarray) -> list[Any]:
     """Returns the state of `Ledger.state` for each of the given worlds."""
-    states = []
-    for index in indices.tolist():
-      episodes = _episodes_of(index, self._log[self._last_start(index) :])
-      states.append(_state_of(episodes[-1] if episodes else None))
-    return states
+    return [self._ledger(index).state() for index in indices.tolist()]
 
   def set_state(self, indices: np.ndarray, states: Sequence[Any]) -> None:
     """Adds saved episodes and continues them; see `Ledger.set_state`."""
-    by_index = dict(zip(indices.tolist(), states, strict=True))
-    self._log.append(_Restored(by_index))
+    for index, state in zip(indices.tolist(), states, strict=True):
+      self._ledger(index).set_state(state)
 
-  def _last_start(self, world: int) -> int:
-    """Returns the log position at which a world's last episode begins."""
-    for i in range(len(self._log) - 1, -1, -1):
-      entry = self._log[i]
-      if isinstance(entry, _Restored):
-        if world in entry.states:
-          return i
-      elif entry.is_first[world]:
-        return i
-    return len(self._log)
-
-
-def _episodes_of(
-    world: int, log: Iterable[events.BatchStep | _Restored]
-) -> list[EpisodeLedger]:
-  """Assembles the episodes of one world from the log of a batch."""
-  episodes: list[EpisodeLedger] = []
-  for step in log:
-    if isinstance(step, _Restored):
-      state = step.states.get(world)
-      if state is not None:
-        episodes.append(_from_state(state))
-      continue
-    if step.is_first[world]:
-      episode = EpisodeLedger(
-          int(step.seed[world]),
-          int(step.world[world]),
-          int(step.episode[world]),
-          {},
-          [],
-      )
-      episode.add([*step.initial, *step.agent_reads], world)
-      episodes.append(episode)
-    elif not step.has_failed[world] and _is_running(episodes):
-      episode = episodes[-1]
-      episode.add_reward(float(step.true_reward[world]), step.failure)
-      episode.add([*step.records, *step.agent_reads], world)
-    if world in step.ends and _is_running(episodes):
-      episodes[-1].end = step.ends[world]
-  return episodes
-
-
-def _is_running(episodes: Sequence[EpisodeLedger]) -> bool:
-  """Returns False after an end, from which a branch continues the physics."""
-  return bool(episodes) and episodes[-1].end is None
+  def _ledger(self, world: int) -> Ledger:
+    """Returns the ledger of a world, with all steps so far."""
+    for step in self._steps:
+      for index in range(len(step.is_first)):
+        self._ledgers[index].add_world(step, index)
+    self._steps.clear()
+    return self._ledgers[world]
 
 
 def true_return(episode: EpisodeLedger) -> float:

@@ -1,4 +1,4 @@
-"""Traces: actions and register positions of evaluated episodes.
+"""Traces: actions of evaluated episodes.
 
 The actions and the seed are sufficient to replay an episode, for example for a
 film, on any machine with the same physics.
@@ -36,18 +36,12 @@ class Tracer(events.BatchEventSink):
       batch: The worlds, before their first episode.
       actor: Actor that chooses the actions.
     """
-    self._batch = batch
     self._actor = actor
     self._actions: list[np.ndarray] = []
     num_envs = batch.num_envs
     self._num_steps = np.full(num_envs, -1)
     # Objects, because seeds can be large.
     self._ids = np.zeros((3, num_envs), object)
-    self._start = self._positions()
-    self._end = {
-        name: np.full_like(blocks, np.nan)
-        for name, blocks in self._start.items()
-    }
 
   def act(self, time_step: batch_time_steps.BatchTimeStep) -> Any:
     """Returns the actor's actions, `(worlds, *action_spec.shape)`."""
@@ -57,17 +51,10 @@ class Tracer(events.BatchEventSink):
 
   def step_ended(self, step: events.BatchStep) -> None:
     if not self._actions:
-      self._start = self._positions()
       self._ids = np.array([step.seed, step.world, step.episode], object)
       return
     indices = [w for w in step.ends if self._num_steps[w] < 0]
-    if not indices:
-      return
     self._num_steps[indices] = len(self._actions)
-    # Positions are meaningless where the physics has failed.
-    valid = [world for world in indices if not step.has_failed[world]]
-    for name, blocks in self._positions().items():
-      self._end[name][valid] = blocks[valid]
 
   def trace(self) -> dict[str, Any]:
     """Returns the trace as plain data.
@@ -79,10 +66,6 @@ class Tracer(events.BatchEventSink):
         has not ended.
       actions: Actions, `(steps, worlds, *action_spec.shape)`. Those after the
         end of an episode have no meaning.
-      registers: Horizontal positions of the centres of each register's blocks
-        at the `start` and the `end` of the episode, by name, each
-        `(worlds, blocks, 2)` in metres; nan if unknown. The base block, if
-        there is one, is the first block.
     """
     seed, world, episode = self._ids.tolist()
     longest = max(int(self._num_steps.max()), 0)
@@ -92,22 +75,4 @@ class Tracer(events.BatchEventSink):
         'episode': episode,
         'num_steps': self._num_steps.copy(),
         'actions': np.array(self._actions[:longest]),
-        'registers': {
-            name: {'start': self._start[name], 'end': self._end[name]}
-            for name in self._start
-        },
-    }
-
-  def _positions(self) -> dict[str, np.ndarray]:
-    """Returns horizontal block positions by register, `(worlds, blocks, 2)`."""
-    physics = self._batch.physics
-    return {
-        name: np.stack(
-            [
-                np.array(physics.bind(block.geom).xpos)[..., :2]
-                for block in register.blocks
-            ],
-            axis=1,
-        )
-        for name, register in self._batch.mechanism.registers.items()
     }
