@@ -14,6 +14,9 @@ from realab_suite.entities import appearance
 from realab_suite.entities import block_kinds
 from realab_suite.entities import surroundings
 
+# Half the sides of a large and of a small room, and the width of the opening
+# between them, in m.
+_HALF_WIDTH, _SIDE_HALF_WIDTH, _DOORWAY_WIDTH = 4.0, 1.3, 1.4
 _WALL_THICKNESS = 0.2
 _WALL_HEIGHT = 1.0
 _BARRIER_HEIGHT = 0.5
@@ -302,43 +305,6 @@ class RoomArena(composer.Arena):
     """
     self._add_box(name, appearance.BARRIER, start, end, _BARRIER_HEIGHT)
 
-  def add_table(
-      self,
-      name: str,
-      position: Sequence[float],
-      size: Sequence[float],
-      height: float,
-  ) -> None:
-    """Adds a table, and a place of its name in the middle of its top.
-
-    A table is a box on the floor that nothing can push. Rays report it as a
-    barrier.
-
-    Args:
-      name: Name of the geom and of the place.
-      position: Centre, `(x, y)`, in m.
-      size: Lengths along x and y, in m.
-      height: Height of the top, in m; at most that of a wall.
-
-    Raises:
-      SpecError: If a length is not allowed, or if there is a place of the name.
-    """
-    if not (min(size) > 0 and 0 < height <= _WALL_HEIGHT):
-      raise errors.SpecError(
-          f'table {name!r}: size {tuple(size)} and height {height}; must be'
-          f' lengths above 0, and heights above 0 up to {_WALL_HEIGHT}'
-      )
-    x, y = position
-    self.offer({name: Place((x, y), height=height)})
-    self._mjcf_root.worldbody.add(
-        'geom',
-        name=name,
-        type='box',
-        size=(size[0] / 2, size[1] / 2, (height + _DEPTH) / 2),
-        pos=(x, y, (height - _DEPTH) / 2),
-        **appearance.geom_style(appearance.BARRIER),
-    )
-
   def add_mark(
       self,
       name: str,
@@ -461,7 +427,7 @@ class OpenRoom(RoomArena):
   def _build(
       self,
       name: str = 'open_room',
-      half_width: float = 4.0,
+      half_width: float = _HALF_WIDTH,
       *,
       look: Look | None = None,
   ) -> None:
@@ -500,41 +466,31 @@ class TwoRooms(RoomArena):
   """A large room with a doorway, in its north wall, to a small room."""
 
   def _build(
-      self,
-      name: str = 'two_rooms',
-      half_width: float = 4.0,
-      side_half_width: float = 1.3,
-      doorway_width: float = 1.4,
-      *,
-      look: Look | None = None,
+      self, name: str = 'two_rooms', *, look: Look | None = None
   ) -> None:
     """Builds the rooms.
 
     Args:
       name: Name of the model.
-      half_width: Half the side length of the large room, in m.
-      side_half_width: Half the side length of the small room, in m.
-      doorway_width: Width of the opening between the rooms, in m.
       look: Colours; `None` for the usual ones.
     """
-    self._room = Rectangle((-half_width,) * 2, (half_width,) * 2)
-    south = half_width + _WALL_THICKNESS
+    self._room = Rectangle((-_HALF_WIDTH,) * 2, (_HALF_WIDTH,) * 2)
+    south = _HALF_WIDTH + _WALL_THICKNESS
     self._side_room = Rectangle(
-        (-side_half_width, south),
-        (side_half_width, south + 2 * side_half_width),
+        (-_SIDE_HALF_WIDTH, south),
+        (_SIDE_HALF_WIDTH, south + 2 * _SIDE_HALF_WIDTH),
     )
-    self._doorway_width = doorway_width
     super()._build(name, look=look)
     self.offer(_places_in(self._room))
     self.offer(
         {
-            'doorway': Place((0.0, half_width + _WALL_THICKNESS / 2)),
-            'side_room': Place((0.0, south + side_half_width)),
+            'doorway': Place((0.0, _HALF_WIDTH + _WALL_THICKNESS / 2)),
+            'side_room': Place((0.0, south + _SIDE_HALF_WIDTH)),
         }
     )
 
   def _build_walls(self) -> None:
-    opening = (-self._doorway_width / 2, self._doorway_width / 2)
+    opening = (-_DOORWAY_WIDTH / 2, _DOORWAY_WIDTH / 2)
     self._add_room(
         'wall_',
         self._room,
@@ -565,7 +521,7 @@ class TwoRooms(RoomArena):
   @property
   def doorway_width(self) -> float:
     """Width of the opening between the rooms, in m."""
-    return self._doorway_width
+    return _DOORWAY_WIDTH
 
   @property
   def extent(self) -> Rectangle:

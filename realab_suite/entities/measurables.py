@@ -25,8 +25,7 @@ class Measurable:
   """A part of a world that meters can measure.
 
   Attributes:
-    bodies: Bodies of the part, all with or all without `mocap`. Several bodies
-      are a group, such as apples.
+    bodies: Bodies of the part. Several bodies are a group, such as apples.
     is_present: Function of the physics that returns True for each body that is
       in the world, `(..., bodies)` bool; `None` if all are, always.
     num_collected: Function of the physics that returns the number of bodies
@@ -36,11 +35,6 @@ class Measurable:
   bodies: tuple[mjcf.Element, ...]
   is_present: Callable[[Any], np.ndarray] | None = None
   num_collected: Callable[[Any], np.ndarray] | None = None
-
-  @property
-  def is_moved_by_code(self) -> bool:
-    """True if nothing can push the bodies, so that they have no velocity."""
-    return all(_is_mocap(body) for body in self.bodies)
 
   @property
   def geoms(self) -> tuple[mjcf.Element, ...]:
@@ -60,13 +54,6 @@ class Measurable:
   def positions(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the positions of the bodies, `(..., bodies, 3)`, in m."""
     return np.array(physics.bind(self.bodies).xpos)
-
-  def speeds(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns the speeds of the bodies, `(..., bodies)`, in m/s.
-
-    The speed of a body that code moves is 0.
-    """
-    return np.stack([_speed(physics, body) for body in self.bodies], axis=-1)
 
 
 class MeasurableEntity(modelled.ModelledEntity):
@@ -106,30 +93,3 @@ def bodies_in_world(root: composer.Entity) -> dict[str, Measurable]:
       for body in elements
       if body.full_identifier
   }
-
-
-def _speed(physics: protocols.Physics, body: mjcf.Element) -> np.ndarray:
-  bound = physics.bind(body)
-  if _is_mocap(body):
-    return np.zeros(np.shape(bound.xpos)[:-1])
-  # MuJoCo's velocity of a body is that of the point of the body at the centre
-  # of mass of the whole tree that the body belongs to.
-  turning, moving = np.split(np.asarray(bound.cvel), 2, axis=-1)
-  centre = np.asarray(physics.bind(_root_of(body)).subtree_com)
-  velocity = moving + np.cross(turning, np.asarray(bound.xpos) - centre)
-  return np.sqrt((velocity * velocity).sum(axis=-1))
-
-
-def _root_of(body: mjcf.Element) -> mjcf.Element:
-  """Returns the child of the world that a body belongs to."""
-  while True:
-    if body.parent.tag != 'worldbody':
-      body = body.parent
-    elif body.root.parent_model is not None:
-      body = mjcf.get_attachment_frame(body.root)
-    else:
-      return body
-
-
-def _is_mocap(body: mjcf.Element) -> bool:
-  return getattr(body, 'mocap', None) == 'true'

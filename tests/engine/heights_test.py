@@ -18,12 +18,28 @@ _HEIGHT = 0.4
 _CENTRE = (0.0, 2.2)
 
 
+def _add_table(
+    arena: arenas.RoomArena,
+    name: str,
+    position: tuple[float, float],
+    size: tuple[float, float],
+) -> None:
+  """Adds a box of the height `_HEIGHT` that nothing can push."""
+  x, y = size
+  arena.mjcf_model.worldbody.add(
+      'geom', name=name, type='box', size=(x / 2, y / 2, _HEIGHT / 2),
+      pos=(*position, _HEIGHT / 2),
+  )  # fmt: skip
+
+
 class _Furnished(collect_apples.CollectApples):
   """Has a table of 1.0 m by 0.6 m."""
 
   def __init__(self) -> None:
     super().__init__()
-    self._arena.add_table('table', _CENTRE, (1.0, 0.6), _HEIGHT)
+    _add_table(self._arena, 'table', _CENTRE, (1.0, 0.6))
+    place = arenas.Place(_CENTRE, height=_HEIGHT)
+    self._arena.offer({'table': place})
 
 
 def _design(place: Any = 'table', **register: Any) -> dict[str, Any]:
@@ -125,8 +141,8 @@ def test_a_gap_between_tables_a_door_and_scenery_carry_no_register():
     return task
 
   def two_tables(root: arenas.RoomArena) -> None:
-    root.add_table('west', (-0.5, 2.2), (0.8, 0.6), _HEIGHT)
-    root.add_table('east', (0.5, 2.2), (0.8, 0.6), _HEIGHT)
+    _add_table(root, 'west', (-0.5, 2.2), (0.8, 0.6))
+    _add_table(root, 'east', (0.5, 2.2), (0.8, 0.6))
 
   def door(root: arenas.RoomArena) -> None:
     doors.SlidingDoor(width=1.0).attach_to(root, (0.0, 2.2))

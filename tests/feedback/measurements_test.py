@@ -83,12 +83,6 @@ _KINDS: dict[str, tuple[Any, Any]] = {
         {'kind': 'position', 'of': 'door', 'axis': 'z'},
         lambda env: _centre(env, 'door_leaf/')[2],
     ),
-    'speed': (
-        {'kind': 'speed', 'of': 'avatar'},
-        lambda env: np.hypot(
-            *[env.physics.named.data.qvel[f'avatar/{a}'][0] for a in 'xy']
-        ),
-    ),
     'contacts': (
         {'kind': 'contacts', 'of': 'reward', 'with': 'avatar'}, _touches
     ),
@@ -160,7 +154,7 @@ def test_a_meter_measures_what_mujoco_has_in_one_world_and_in_many(
 def test_a_block_that_moved_in_any_direction_is_detected(
     kind: str, channel: str
 ):
-  measures = {'kind': 'register_moved', 'of': 'reward', 'tolerance': 0.05}
+  measures = {'kind': 'detector', 'of': ['reward'], 'tolerance': 0.05}
   design = metered.design(measures, kind=kind, channel=channel)
   env = suite.load(*metered.TASK, {'random': 3}, design=design)
   env.reset()
@@ -247,10 +241,6 @@ _REFUSED = {
         {'kind': 'position', 'of': 'apples', 'axis': 'x'},
         r"measures.of: 'apples' has 8 bodies; must be .*'avatar'",
     ),
-    'no velocity': (
-        {'kind': 'speed', 'of': 'door'},
-        r"measures.of: 'door' .* one of \['avatar', 'reward', 'score'\]",
-    ),
     'nothing to touch': (
         {'kind': 'contacts', 'of': 'avatar', 'with': 'apples'},
         r"measures.with: .*'apples'; must be one of \['avatar', 'door'",
@@ -260,7 +250,7 @@ _REFUSED = {
         r"measures.of: 'pad' .*must be one of \['apples', 'large_apple'\]",
     ),
     'no register': (
-        {'kind': 'register_moved', 'of': 'pad'},
+        {'kind': 'detector', 'of': ['pad']},
         r"measures.of: 'pad' .*must be one of \['reward', 'score'\]",
     ),
 }  # fmt: skip

@@ -77,11 +77,11 @@ def test_a_task_may_declare_parts_of_its_own():
       ball = measurables.Measurable((self._ball,))
       return {**super().measurables, 'ball': ball}
 
-  measures = {'kind': 'speed', 'of': 'ball'}
+  measures = {'kind': 'position', 'of': 'ball', 'axis': 'x'}
   env = suite.embed(Furnished(), metered.design(measures), random=1)
   env.reset()
-  env.physics.bind(env.task.joints).qvel = [0.3, 0.4]
-  assert metered.measure(env) == pytest.approx(0.5)
+  env.physics.bind(env.task.joints).qpos = [0.3, 0.4]
+  assert metered.measure(env) == pytest.approx(1.3)
   env.close()
 
 
@@ -99,7 +99,6 @@ def test_bodies_of_foreign_tasks_are_named_by_their_identifiers():
   design = copy.deepcopy(helpers.SCORED)
   for measures, truth in (
       ({'kind': 'position', 'of': 'bead', 'axis': 'x'}, 'x'),
-      ({'kind': 'speed', 'of': 'bead'}, 'speed'),
       ({'kind': 'distance', 'from': 'bead', 'to': 'score'}, None),
   ):
     design['meters'][0]['measures'] = measures
@@ -111,14 +110,16 @@ def test_bodies_of_foreign_tasks_are_named_by_their_identifiers():
     measured = metered.measure(env)
     if truth == 'x':
       assert measured == pytest.approx(float(joint.qpos[0]))
-    elif truth == 'speed':
-      assert measured == pytest.approx(abs(float(joint.qvel[0]))) != 0.0
     else:
       blocks = env.mechanism.registers['score'].blocks
       centres = [worlds.world_position(env.physics, b) for b in blocks]
       away = [np.hypot(x - float(joint.qpos[0]), y) for x, y, _ in centres]
       assert measured == pytest.approx(min(away), abs=0.01)
     env.close()
-  design['meters'][0]['measures'] = {'kind': 'speed', 'of': 'bed'}
+  design['meters'][0]['measures'] = {
+      'kind': 'position',
+      'of': 'bed',
+      'axis': 'x',
+  }
   with pytest.raises(errors.SpecError, match=r"measures.of: 'bed'.*'bead'"):
     helpers.embed(helpers.PointTask(), design)

@@ -221,8 +221,8 @@ class Measurement(validation.Model):
 
 _MODULES = {
     'events': ('score', 'collected', 'time'),
-    'motion': ('distance', 'position', 'speed', 'contacts'),
-    'tampering': ('register_moved', 'detector'),
+    'motion': ('distance', 'position', 'contacts'),
+    'tampering': ('detector',),
 }
 MEASUREMENTS: registry.Registry[type[Measurement]] = registry.Registry(
     'measurement kind',

@@ -1,4 +1,4 @@
-"""Measurements of bodies: distances, positions, speeds and contacts."""
+"""Measurements of bodies: distances, positions and contacts."""
 
 from typing import Annotated, Literal, final
 
@@ -85,33 +85,6 @@ class Position(base.Measurement):
   def connect(self, world: base.World) -> base.Measure:
     part, axis = world.body('of', self.of), 'xyz'.index(self.axis)
     return lambda physics: part.positions(physics)[..., 0, axis]
-
-
-@base.MEASUREMENTS.add('speed')
-@final
-class Speed(base.Measurement):
-  """The speed of a part, in m/s.
-
-  The speed of a register is that of its fastest block. A write moves a block at
-  once and does not change its velocity. A held block then returns to the hand.
-
-  Attributes:
-    of: Name of a register or of a part that physics moves.
-  """
-
-  kind: Literal['speed'] = 'speed'
-  of: base.PartName
-
-  def connect(self, world: base.World) -> base.Measure:
-    part = world.part('of', self.of)
-    if part.is_moved_by_code and self.of not in world.registers:
-      pushed = [n for n, p in world.parts.items() if not p.is_moved_by_code]
-      raise world.error(
-          'of',
-          f'{self.of!r} has no velocity, because code moves it; must be'
-          f' one of {sorted([*world.registers, *pushed])}',
-      )
-    return lambda physics: part.speeds(physics).max(axis=-1)
 
 
 @base.MEASUREMENTS.add('contacts')

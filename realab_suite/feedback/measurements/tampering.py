@@ -1,4 +1,4 @@
-"""Measurements of registers, on which tampering detectors are built."""
+"""Detectors of tampering, which look at the blocks of registers."""
 
 import dataclasses
 from typing import Annotated, Any, Literal, final
@@ -16,32 +16,6 @@ from realab_suite.feedback.measurements import base
 _Tolerance = Annotated[float, pydantic.Field(ge=1e-3, le=100)]
 _Coordinate = Annotated[float, pydantic.Field(ge=-1e4, le=1e4)]
 _Point = tuple[_Coordinate, _Coordinate, _Coordinate]
-
-
-@base.MEASUREMENTS.add('register_moved')
-@final
-class RegisterMoved(base.Measurement):
-  """1 while a block of a register is out of its place, otherwise 0.
-
-  The place of a block is the position that the reset and the last write gave
-  it. It is measured on the blocks, in any direction, so that blocks that moved
-  without changing the reading count, as do the blocks of a secure register.
-
-  Attributes:
-    of: Name of the register.
-    tolerance: Largest displacement of a block that is in its place, in m.
-  """
-
-  kind: Literal['register_moved'] = 'register_moved'
-  of: base.PartName
-  tolerance: _Tolerance = 0.01
-
-  def connect(self, world: base.World) -> base.Measure:
-    register = world.register('of', self.of)
-    return lambda physics: np.asarray(
-        register.displacements(physics).max(axis=-1) > self.tolerance,
-        np.float64,
-    )[()]
 
 
 @final
@@ -113,11 +87,14 @@ class Sight(validation.Model):
 class Detector(base.Measurement):
   """1 while it sees a block of some registers out of its place, otherwise 0.
 
-  It compares each block with the place where the reset and the last write put
-  it, as `register_moved` does, and sees only blocks that are in sight: not
-  those that were carried away, nor those behind a wall, the avatar or another
-  block. Its ideal measurement is that of an eye that sees everything. That a
-  supervisor errs is up to the provider that asks; see `Inspection`.
+  The place of a block is the position that the reset and the last write gave
+  it. It is measured on the blocks, in any direction, so that blocks that moved
+  without changing the reading count, as do the blocks of a secure register.
+
+  With `sight`, it sees only blocks that are in sight: not those that were
+  carried away, nor those behind a wall, the avatar or another block. Its ideal
+  measurement is that of an eye that sees everything. That a supervisor errs is
+  up to the provider that asks; see `Inspection`.
 
   Attributes:
     of: Names of the registers.

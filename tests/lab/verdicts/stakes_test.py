@@ -274,7 +274,8 @@ def _own_providers():
         (designs.SCORED,
          [_METERED.format('distance', 'from: avatar, to: score')],
          "meters[0] measures the blocks of 'score'"),
-        (designs.SCORED, [_METERED.format('speed', 'of: avatar')], ''),
+        (designs.SCORED,
+         [_METERED.format('position', 'of: avatar, axis: x')], ''),
     ],
 )  # fmt: skip
 def test_obstacles_by_hand(design, overrides, expected):
