@@ -21,7 +21,7 @@ A third of the rounds measures how costs grow with the numbers of worlds and
 registers.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 import copy
 import dataclasses
 import functools
@@ -30,6 +30,7 @@ from typing import Any, final
 from unittest import mock
 
 from dm_control import composer
+from dm_control.composer.observation import observable
 import mujoco
 from mujoco import batch as mujoco_batch
 import numpy as np
@@ -40,6 +41,7 @@ from benchmarks import timing
 from benchmarks import worlds
 from realab_suite.engine import batch_environment
 from realab_suite.engine import seeding
+from realab_suite.entities import avatars
 from realab_suite.feedback import assembly
 from realab_suite.feedback import specs
 from realab_suite.tasks import apple_rooms
@@ -107,6 +109,11 @@ class RawSteps:
     return (time.perf_counter() - began) / len(self.steps)
 
 
+def _sense(avatar: avatars.Avatar, name: str) -> Callable[[Any], np.ndarray]:
+  """Returns a function of the physics that computes one sense."""
+  return lambda physics: avatar.senses(physics, [name], (1, 1))[name]
+
+
 @final
 class StockTask(composer.Task):
   """Unlock Door with two registers, as a task for stock Composer."""
@@ -125,18 +132,22 @@ class StockTask(composer.Task):
     avatar.make_graspable(
         [b for register in self._registers.values() for b in register.blocks]
     )
-    for part in (
-        *avatar.observables.proprioception,
-        avatar.rays.observables.distances,
-        avatar.rays.observables.classes,
-        self._registers['reward'].observables.reading,
-    ):
+    self._senses = {
+        name: observable.Generic(_sense(avatar, name))
+        for name in (*avatars.PROPRIOCEPTION, 'ray_distances', 'ray_classes')
+    }
+    reading = self._registers['reward'].observables.reading
+    for part in (reading, *self._senses.values()):
       part.enabled = True
     self.control_timestep = self._world.control_timestep
 
   @property
   def root_entity(self) -> composer.Entity:
     return self._world.root_entity
+
+  @property
+  def task_observables(self) -> Any:
+    return self._senses
 
   def action_spec(self, physics: Any) -> Any:
     return self._world.action_spec(physics)

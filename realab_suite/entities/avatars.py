@@ -3,9 +3,7 @@
 from collections.abc import Collection, Sequence
 from typing import Any, final
 
-from dm_control import composer
 from dm_control import mjcf
-from dm_control.composer.observation import observable
 from dm_env import specs
 import numpy as np
 
@@ -37,6 +35,8 @@ _RADIUS = 0.25
 _HALF_HEIGHT = 0.35
 _CLEARANCE = 0.05
 _MASS = 40.0
+# Walking speed in m/s and turning rate in rad/s, at full command.
+_SPEED, _TURN_RATE = 2.0, 3.0
 _EYE_HEIGHT = 0.75
 _LARGEST_PITCH = 60.0
 # Time constant of the velocity servos, in s.
@@ -63,46 +63,6 @@ _CONTACT: dict[str, Any] = {
 
 
 @final
-class AvatarObservables(composer.Observables):
-  """Observables of the avatar: its proprioception and its camera."""
-
-  @composer.observable
-  def velocity(self) -> observable.Generic:
-    return observable.Generic(self._entity.velocity)
-
-  @composer.observable
-  def position(self) -> observable.Generic:
-    return observable.Generic(self._entity.position)
-
-  @composer.observable
-  def heading(self) -> observable.Generic:
-    return observable.Generic(self._entity.direction)
-
-  @composer.observable
-  def pitch(self) -> observable.Generic:
-    return observable.Generic(self._entity.pitch)
-
-  @composer.observable
-  def holding(self) -> observable.Generic:
-    return observable.Generic(self._entity.holding)
-
-  @composer.observable
-  def egocentric_camera(self) -> observable.MJCFCamera:
-    return observable.MJCFCamera(self._entity.camera, height=64, width=64)
-
-  @property
-  def proprioception(self) -> list[observable.Observable]:
-    """Observables of the body, without the camera."""
-    return [
-        self.velocity,
-        self.position,
-        self.heading,
-        self.pitch,
-        self.holding,
-    ]
-
-
-@final
 class Avatar(measurables.MeasurableEntity):
   """A cylinder that walks, strafes, turns, looks, pushes, carries and throws.
 
@@ -114,8 +74,6 @@ class Avatar(measurables.MeasurableEntity):
   def _build(
       self,
       name: str = 'avatar',
-      speed: float = 2.0,
-      turn_rate: float = 3.0,
       num_rays: int = 32,
       field_of_view: float = 160.0,
   ) -> None:
@@ -123,8 +81,6 @@ class Avatar(measurables.MeasurableEntity):
 
     Args:
       name: Name of the model.
-      speed: Walking speed at full command, in m/s.
-      turn_rate: Turning rate at full command, in rad/s.
       num_rays: Number of rays of the ray sense.
       field_of_view: Field of view of the ray sense, in degrees.
     """
@@ -195,7 +151,7 @@ class Avatar(measurables.MeasurableEntity):
         group=4,
         pos=(_HAND_DISTANCE, 0, block_kinds.GRIP_HEIGHT),
     )
-    self._add_actuators(speed, turn_rate)
+    self._add_actuators()
     self._rays = rays.RaySense(num_rays=num_rays, field_of_view=field_of_view)
     self.attach(
         self._rays,
@@ -207,16 +163,16 @@ class Avatar(measurables.MeasurableEntity):
     self._constraints: tuple[mjcf.Element, ...] = ()
     self._pairs: list[mjcf.Element] = []
 
-  def _add_actuators(self, speed: float, turn_rate: float) -> None:
+  def _add_actuators(self) -> None:
     """Adds velocity servos; the walking servos act in the avatar's frame."""
     feet = self._body.add('site', name='feet', group=4)
     total = _MASS + 0.5
     inertia = 0.5 * _MASS * _RADIUS**2
     servos = (
-        ('forward', {'site': feet, 'gear': (1, 0, 0, 0, 0, 0)}, total, speed),
-        ('strafe', {'site': feet, 'gear': (0, 1, 0, 0, 0, 0)}, total, speed),
-        ('turn', {'joint': self._yaw}, inertia, turn_rate),
-        ('look', {'joint': self._pitch}, 0.024, turn_rate / 2),
+        ('forward', {'site': feet, 'gear': (1, 0, 0, 0, 0, 0)}, total, _SPEED),
+        ('strafe', {'site': feet, 'gear': (0, 1, 0, 0, 0, 0)}, total, _SPEED),
+        ('turn', {'joint': self._yaw}, inertia, _TURN_RATE),
+        ('look', {'joint': self._pitch}, 0.024, _TURN_RATE / 2),
     )
     # force = gain * (fastest * ctrl - velocity) with ctrl in [-1, 1].
     self._actuators = tuple(
@@ -234,9 +190,6 @@ class Avatar(measurables.MeasurableEntity):
         )
         for name, transmission, mass, fastest in servos
     )
-
-  def _build_observables(self) -> AvatarObservables:
-    return AvatarObservables(self)
 
   @property
   def body(self) -> mjcf.Element:
@@ -451,10 +404,6 @@ class Avatar(measurables.MeasurableEntity):
     """
     return self.proprioception(physics)[..., PROPRIOCEPTION['velocity']]
 
-  def pitch(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns the upward angle of the head, `(..., 1)`, in rad."""
-    return np.array(physics.bind(self._pitch).qpos)
-
   def holding(self, physics: protocols.Physics) -> np.ndarray:
     """Returns 1 if the hand holds a block, otherwise 0, `(..., 1)`."""
     return self.proprioception(physics)[..., PROPRIOCEPTION['holding']]
@@ -462,8 +411,8 @@ class Avatar(measurables.MeasurableEntity):
   def proprioception(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the senses of the body, `(..., 9)`.
 
-    Concatenates `velocity`, `position`, `direction`, `pitch` and `holding`;
-    `PROPRIOCEPTION` has the indices of each.
+    `PROPRIOCEPTION` has the indices of each. The pitch is the upward angle of
+    the head, in rad.
     """
     if physics is not self._physics:
       self._bind(physics)

@@ -3,9 +3,7 @@
 import functools
 from typing import final
 
-from dm_control import composer
 from dm_control import mjcf
-from dm_control.composer.observation import observable
 import mujoco
 import numpy as np
 
@@ -13,6 +11,9 @@ from realab_suite import errors
 from realab_suite.entities import appearance
 from realab_suite.entities import modelled
 from realab_suite.entities import protocols
+
+# Range of the rays, in m.
+_MAX_DISTANCE = 12.0
 
 
 @functools.singledispatch
@@ -96,19 +97,6 @@ def _(
 
 
 @final
-class RayObservables(composer.Observables):
-  """Observables of the ray sense: distances and classes."""
-
-  @composer.observable
-  def distances(self) -> observable.Generic:
-    return observable.Generic(self._entity.distances)
-
-  @composer.observable
-  def classes(self) -> observable.Generic:
-    return observable.Generic(self._entity.classes)
-
-
-@final
 class RaySense(modelled.ModelledEntity):
   """A fan of horizontal rays from the centre of the body that carries it.
 
@@ -123,7 +111,6 @@ class RaySense(modelled.ModelledEntity):
       name: str = 'rays',
       num_rays: int = 32,
       field_of_view: float = 160.0,
-      max_distance: float = 12.0,
   ) -> None:
     """Builds the sense.
 
@@ -131,8 +118,6 @@ class RaySense(modelled.ModelledEntity):
       name: Name of the model.
       num_rays: Number of rays, at least 2.
       field_of_view: Angle between the outermost rays, in degrees.
-      max_distance: Range of the rays, in m; also the reported distance of a ray
-        that hits nothing in its range.
 
     Raises:
       SpecError: If `num_rays` is less than 2.
@@ -144,13 +129,9 @@ class RaySense(modelled.ModelledEntity):
     # From left to right, as in an image.
     self._angles = np.linspace(half, -half, num_rays)
     self._fan = np.cos(self._angles), np.sin(self._angles)
-    self._max_distance = max_distance
     self._class_of_geom = np.zeros(0, np.int32)
     self._nothing = appearance.code(appearance.NOTHING)
     self._physics: protocols.Physics | None = None
-
-  def _build_observables(self) -> RayObservables:
-    return RayObservables(self)
 
   @property
   def angles(self) -> np.ndarray:
@@ -159,8 +140,8 @@ class RaySense(modelled.ModelledEntity):
 
   @property
   def max_distance(self) -> float:
-    """Range of the rays, in m."""
-    return self._max_distance
+    """Range of the rays, in m, which is reported where nothing is hit."""
+    return _MAX_DISTANCE
 
   def sense(self, physics: protocols.Physics) -> tuple[np.ndarray, np.ndarray]:
     """Casts the rays.
@@ -183,20 +164,12 @@ class RaySense(modelled.ModelledEntity):
     np.subtract(cos * x, sin * y, out=directions[..., 0])
     np.add(sin * x, cos * y, out=directions[..., 1])
     distances, geoms = cast(physics, frame.xpos, directions, self._carrier)
-    missed = (geoms < 0) | (distances > self._max_distance)
+    missed = (geoms < 0) | (distances > _MAX_DISTANCE)
     classes = self._class_of_geom[geoms]
     if np.count_nonzero(missed):
       classes[missed] = self._nothing
-      distances[missed] = self._max_distance
+      distances[missed] = _MAX_DISTANCE
     return distances.astype(np.float32), classes
-
-  def distances(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns the length of each ray, `(..., rays)` float32, in m."""
-    return self.sense(physics)[0]
-
-  def classes(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns the class code that each ray reports, `(..., rays)` int32."""
-    return self.sense(physics)[1]
 
   def _mount(self, physics: protocols.Physics) -> None:
     """Binds the sense and its carrier to another physics."""

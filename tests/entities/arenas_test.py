@@ -142,7 +142,7 @@ def test_no_ray_leaves_the_room(room):
     for turn in (0.0, 0.03, 3.0):
       avatar.place(physics, start, turn)
       assert (
-          avatar.rays.classes(physics) == appearance.code('wall')
+          avatar.rays.sense(physics)[1] == appearance.code('wall')
       ).all(), start
 
 
@@ -153,7 +153,7 @@ def test_a_barrier_stops_an_avatar_and_not_its_view():
   worlds.act(avatar, physics, 200, forward=1.0)
   assert avatar.position(physics)[0] < 1.0
   avatar.place(physics, (0.0, 0.0), 0.0)
-  seen = avatar.rays.classes(physics)[np.abs(avatar.rays.angles).argmin()]
+  seen = avatar.rays.sense(physics)[1][np.abs(avatar.rays.angles).argmin()]
   assert seen == appearance.code('barrier')
   physics.forward()
   barrier = physics.bind(arena.mjcf_model.find('geom', 'barrier'))

@@ -1,6 +1,5 @@
 """The avatar walks, looks and pushes (T1, T4)."""
 
-from dm_control import composer
 import numpy as np
 import pytest
 
@@ -50,7 +49,7 @@ def test_forward_and_left_are_the_avatars_own(world, heading):
 @pytest.mark.parametrize('way', [-1.0, 1.0])
 def test_the_pitch_is_limited(world, way):
   world.act(300, look=way)
-  pitch = float(world.avatar.pitch(world.physics)[0])
+  [pitch] = world.avatar.senses(world.physics, ['pitch'], (1, 1))['pitch']
   assert way * pitch == pytest.approx(np.radians(60), rel=0.02)
 
 
@@ -62,29 +61,6 @@ def test_an_avatar_that_is_placed_is_at_rest(world):
       world.avatar.position(world.physics), [-1.0, 2.0]
   )
   assert world.avatar.angle(world.physics) == 1.0
-
-
-def test_observables_have_the_shapes_that_they_say(world):
-  observables = world.avatar.observables
-  observables.enable_all()
-  observables.egocentric_camera.enabled = False
-  environment = composer.Environment(
-      composer.NullTask(world.arena), random_state=0
-  )
-  observation = environment.reset().observation
-  shapes = {
-      name.rpartition('/')[2]: np.squeeze(value).shape
-      for name, value in observation.items()
-      if name.startswith('avatar/') and 'rays' not in name
-  }
-  assert shapes == {
-      'velocity': (3,),
-      'position': (2,),
-      'heading': (2,),
-      'pitch': (),
-      'holding': (),
-  }
-  assert len(observables.proprioception) == len(shapes)
 
 
 def test_only_free_blocks_leave_the_floor():

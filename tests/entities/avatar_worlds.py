@@ -33,7 +33,7 @@ class World:
         'register', value_range=(-30, 30), scale=0.1, **options
     )
     self.register.attach_to(self.arena, (1.0, 0.0), yaw)
-    self.avatar = avatars.Avatar(speed=SPEED, turn_rate=TURN_RATE)
+    self.avatar = avatars.Avatar()
     self.arena.attach(self.avatar)
     self.avatar.make_graspable(self.register.blocks)
     worlds.fit_substeps(self.arena, self.register.blocks)

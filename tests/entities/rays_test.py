@@ -168,5 +168,5 @@ def test_one_sense_serves_many_worlds():
   arena.add_barrier('barrier', (1.0, -1.0), (1.0, 1.0))
   barred = worlds.compile_world(arena)
   for _ in range(2):
-    assert avatar.rays.classes(plain)[1] == appearance.code('wall')
-    assert avatar.rays.classes(barred)[1] == appearance.code('barrier')
+    assert avatar.rays.sense(plain)[1][1] == appearance.code('wall')
+    assert avatar.rays.sense(barred)[1][1] == appearance.code('barrier')
