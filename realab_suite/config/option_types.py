@@ -14,7 +14,6 @@ import dataclasses
 import functools
 import inspect
 import json
-import operator
 import re
 from typing import Annotated, Any, final
 
@@ -94,19 +93,6 @@ class ModelIn:
         raise ValueError('must be a name, or a mapping with a kind')
     kind = self._kind.model_validate(value).kind
     return self._models.get(kind).model_validate(value, context=info.context)
-
-  def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> Any:
-    del schema
-    models = (self._models.get(kind) for kind in self._models)
-    union: Any = functools.reduce(operator.or_, models)
-    union_schema = handler(
-        pydantic.TypeAdapter(
-            Annotated[union, pydantic.Field(discriminator='kind')]
-        ).core_schema
-    )
-    if self._name is None:
-      return union_schema
-    return {'anyOf': [self._name.json_schema(), union_schema]}
 
 
 @final

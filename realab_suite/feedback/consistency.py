@@ -13,18 +13,18 @@ from realab_suite.config import messages
 from realab_suite.feedback import objectives
 from realab_suite.policies import action_sets
 
-# Roles of the registers that agents read.
-_READ_BY_AGENTS = ('feedback', 'signal')
+# Roles of registers that the agent reads, and of those that providers write.
+READ_BY_AGENTS = ('feedback', 'signal')
+WRITTEN_BY_PROVIDERS = (*READ_BY_AGENTS, 'memory')
 # Roles of the registers that agents neither read nor write.
 _HIDDEN_FROM_AGENTS = ('meter', 'memory')
 
 
-def check(design: Any, written_by_providers: Sequence[str]) -> None:
+def check(design: Any) -> None:
   """Checks a design.
 
   Args:
     design: A `specs.DesignSpec` with valid fields.
-    written_by_providers: Roles of the registers that providers may write.
 
   Raises:
     ValueError: If registers, meters, providers and learner do not fit each
@@ -38,9 +38,7 @@ def check(design: Any, written_by_providers: Sequence[str]) -> None:
     for name in provider.reads:
       _expect_role(design, f'{where}.reads', name, None)
     for name in provider.writes:
-      _expect_role(design, f'{where}.writes', name, written_by_providers)
-    _refuse_duplicates(f'{where}.reads', provider.reads)
-    _refuse_duplicates(f'{where}.writes', provider.writes)
+      _expect_role(design, f'{where}.writes', name, WRITTEN_BY_PROVIDERS)
     try:
       provider.check(design)
     except ValueError as error:
@@ -82,17 +80,6 @@ def _expect_role(
         f'{where}: register {name!r} has role {role!r}; must be one'
         f' of {list(roles)}'
     )
-
-
-def _refuse_duplicates(where: str, names: Sequence[str]) -> None:
-  """Refuses a list that names a register twice."""
-  listed: set[str] = set()
-  for name in names:
-    if name in listed:
-      raise ValueError(
-          f'{where}: register {name!r} is listed twice; must be listed once'
-      )
-    listed.add(name)
 
 
 def _refuse_equal_ports(design: Any) -> None:
@@ -151,7 +138,7 @@ def _refuse_unwritten(design: Any) -> None:
   for register, names in design.ports_by_register.items():
     spec = design.registers[register]
     if (
-        spec.role in _READ_BY_AGENTS
+        spec.role in READ_BY_AGENTS
         and written.isdisjoint(names)
         and 'initial' not in spec.model_fields_set
     ):
@@ -241,7 +228,7 @@ def _check_learner(design: Any) -> None:
       objectives.refuse_misspelling(design.learner.kind)
     return
   for names, description, allowed in (
-      (objective.registers, 'register that agents read', _READ_BY_AGENTS),
+      (objective.registers, 'register that agents read', READ_BY_AGENTS),
       (objective.queries or (), 'query register', ('query',)),
   ):
     ports = design.names(*allowed)

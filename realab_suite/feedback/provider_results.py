@@ -6,6 +6,7 @@ from typing import Any, NamedTuple, final
 import numpy as np
 
 from realab_suite import errors
+from realab_suite import trees
 from realab_suite.config import messages
 from realab_suite.entities import axes
 from realab_suite.feedback import providers
@@ -186,23 +187,11 @@ def merged(where: str, state: Any, other: Any, worlds: np.ndarray) -> Any:
   Raises:
     FeedbackProviderError: If the states have different structures.
   """
-  is_same = type(state) is type(other)
-  if is_same and isinstance(state, dict) and state.keys() == other.keys():
-    return {
-        key: merged(f'{where}[{key!r}]', part, other[key], worlds)
-        for key, part in state.items()
-    }
-  is_sequence = is_same and isinstance(state, tuple | list)
-  if is_sequence and len(state) == len(other):
-    return type(state)(
-        merged(f'{where}[{i}]', part, other[i], worlds)
-        for i, part in enumerate(state)
-    )
-  if np.shape(state) == np.shape(other) and isinstance(other, np.ndarray):
-    result = np.array(state)
-    result[worlds] = other[worlds]
-    return result
-  raise errors.FeedbackProviderError(
-      f'{where}: {messages.quote(state)}; must have the structure of the'
-      f' initial state, {messages.quote(other)}'
-  )
+  rows = np.flatnonzero(worlds) if worlds.dtype == bool else worlds
+  try:
+    return trees.put(state, rows, trees.taken(other, rows))
+  except (AttributeError, IndexError, TypeError, ValueError) as error:
+    raise errors.FeedbackProviderError(
+        f'{where}: {messages.quote(state)}; must have the structure of the'
+        f' initial state, {messages.quote(other)}'
+    ) from error

@@ -31,9 +31,8 @@ Coordinate = Annotated[float, pydantic.Field(ge=-1e4, le=1e4)]
 # number. MuJoCo reserves 160 MB for their contacts, quadratic in the number.
 MAX_REGISTERS = 100
 
-# Roles of registers that the agent reads, and of those that providers write.
-READ_BY_AGENTS = ('feedback', 'signal')
-WRITTEN_BY_PROVIDERS = (*READ_BY_AGENTS, 'memory')
+READ_BY_AGENTS = consistency.READ_BY_AGENTS
+WRITTEN_BY_PROVIDERS = consistency.WRITTEN_BY_PROVIDERS
 
 
 @final
@@ -206,11 +205,6 @@ class ActionSetSpec(validation.Spec):
       raise ValueError('must be a name, or a mapping with name and version')
     return data
 
-  @classmethod
-  def __get_pydantic_json_schema__(cls, schema: Any, handler: Any) -> Any:
-    name = pydantic.TypeAdapter(Name).json_schema()
-    return {'anyOf': [name, handler(schema)]}
-
   @pydantic.model_validator(mode='after')
   def _known(self) -> 'ActionSetSpec':
     action_sets.get(self.name, self.version)
@@ -276,9 +270,7 @@ class DesignSpec(validation.Spec):
   description: str = ''
   channel: arguments.Channel = 'embedded'
   dof: arguments.Dof = 'free'
-  registers: dict[Name, RegisterSpec] = pydantic.Field(
-      default_factory=dict, json_schema_extra={'maxProperties': MAX_REGISTERS}
-  )
+  registers: dict[Name, RegisterSpec] = pydantic.Field(default_factory=dict)
   meters: Annotated[tuple[MeterSpec, ...], pydantic.Field(strict=False)] = ()
   providers: Annotated[
       tuple[_AnyProvider, ...],
@@ -295,7 +287,7 @@ class DesignSpec(validation.Spec):
           f'registers: {len(self.registers)} are given; there must be at most'
           f' {MAX_REGISTERS}'
       )
-    consistency.check(self, WRITTEN_BY_PROVIDERS)
+    consistency.check(self)
     return self
 
   @functools.cached_property
@@ -462,11 +454,6 @@ def load(
     UnknownNameError: If there is no design or file of this name.
   """
   return _DOCUMENTS.load(design, overrides, is_confined=is_confined)
-
-
-def json_schema() -> dict[str, Any]:
-  """Returns the JSON Schema of design files, for use in editors."""
-  return DesignSpec.model_json_schema(by_alias=True)
 
 
 def inputs_of(provider: providers.Provider, design: DesignSpec) -> list[str]:

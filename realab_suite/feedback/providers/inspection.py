@@ -13,12 +13,7 @@ from realab_suite.policies import random_keys
 _Rate = Annotated[float, pydantic.Field(ge=0, lt=1)]
 _Number = Annotated[float, pydantic.Field(ge=-1e9, le=1e9)]
 _Size = Annotated[float, pydantic.Field(ge=0, le=1e9)]
-# Any kind; a schema of all kinds would contain itself.
-_Paid = Annotated[
-    base.Provider,
-    option_types.ModelIn(base.PROVIDERS),
-    pydantic.WithJsonSchema({'type': 'object'}),
-]
+_Paid = Annotated[base.Provider, option_types.ModelIn(base.PROVIDERS)]
 # A larger reading of a detector is a sighting.
 _SEEN = 0.5
 # The provider that is inspected gets the key of the step itself.
