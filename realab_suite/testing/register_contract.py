@@ -1,6 +1,6 @@
 """Contract of registers: what every kind of register promises."""
 
-from typing import Any, NamedTuple, final
+from typing import Any, final
 
 import numpy as np
 
@@ -77,23 +77,16 @@ def check_register(
   options['value_range'] = value_range
   world = _World(kind, options)
   for register in world.registers:
-    subject = _Subject(register, world, _where(register))
-    _check_values(subject)
-    _check_looks(subject)
-    _check_shoves(subject)
+    contract = _Contract(register, world)
+    contract.check_values()
+    contract.check_looks()
+    contract.check_shoves()
     if register.channel == 'embedded':
-      _check_rest(subject)
-      _check_displacements(subject)
-    world.restart()
-    before = snapshots.get_state(world.physics)
-    register.write(world.physics, subject.values[-1])
-    _shove(subject, np.random.default_rng(0))
-    world.restart()
-    contracts.require(
-        np.array_equal(snapshots.get_state(world.physics), before),
-        f'{subject.where}: a reset does not restore everything',
-    )
-  _check_batch(world)
+      contract.check_rest()
+      contract.check_displacements()
+    contract.check_restart()
+  for register in world.registers:
+    _Contract(register, world).check_batch()
   for width in _WIDE:
     for is_upward in (True, False):
       _check_wide_range(kind, options, width, is_upward)
@@ -115,13 +108,11 @@ class _World:
       place = spacing * ((i % 2) - 0.5), spacing * ((i // 2) - 0.5)
       register.attach_to(arena, place, yaw, _SPREAD)
       self.registers.append(register)
+    substep = block_kinds.LONG_SUBSTEP
     blocks = [b for register in self.registers for b in register.blocks]
-    if any(
-        block_kinds.find_misfit(b, block_kinds.LONG_SUBSTEP) for b in blocks
-    ):
-      arena.mjcf_model.option.timestep = block_kinds.SHORT_SUBSTEP
-    else:
-      arena.mjcf_model.option.timestep = block_kinds.LONG_SUBSTEP
+    if any(block_kinds.find_misfit(block, substep) for block in blocks):
+      substep = block_kinds.SHORT_SUBSTEP
+    arena.mjcf_model.option.timestep = substep
     self.physics = single_physics.ThinPhysics.from_mjcf_model(arena.mjcf_model)
     self.restart()
 
@@ -133,103 +124,263 @@ class _World:
 
 
 @final
-class _Subject(NamedTuple):
-  """A register in a world.
+class _Contract:
+  """The checks of a register in a world."""
 
-  Attributes:
-    register: The register.
-    world: Its world.
-    where: Description of the register, for messages.
-  """
+  def __init__(self, register: registers.Register, world: _World) -> None:
+    self._register = register
+    self._world = world
+    self._physics = world.physics
+    low, high = register.value_range
+    values = register.nearest(np.linspace(low, high, _NUM_VALUES))
+    if register.PORTS:  # Those of ports differ.
+      shifted = [np.roll(values, i) for i in range(len(register.PORTS))]
+      values = np.stack(shifted, axis=-1)
+    self._values = values
 
-  register: registers.Register
-  world: _World
-  where: str
+  def _require(self, condition: Any, breach: str) -> None:
+    register = self._register
+    kind, blocks = type(register).__name__, type(register.blocks[0]).__name__
+    contracts.require(
+        condition, f'{kind}, {register.channel} with {blocks}: {breach}'
+    )
 
-  @property
-  def physics(self) -> single_physics.ThinPhysics:
-    """The world."""
-    return self.world.physics
+  def _read(self) -> np.ndarray:
+    return self._register.read(self._physics)
 
-  @property
-  def values(self) -> np.ndarray:
-    """Values of the range, `(values, ...)`; those of ports differ."""
-    low, high = self.register.value_range
-    values = self.register.nearest(np.linspace(low, high, _NUM_VALUES))
-    if not self.register.PORTS:
-      return values
-    shifted = [np.roll(values, i) for i in range(len(self.register.PORTS))]
-    return np.stack(shifted, axis=-1)
+  def _write(self, value: Any) -> np.ndarray:
+    return self._register.write(self._physics, value)
 
-  def read(self) -> np.ndarray:
-    """Returns the reading."""
-    return self.register.read(self.physics)
+  def _state(self) -> np.ndarray:
+    return snapshots.get_state(self._physics)
 
-  def write(self, value: Any) -> np.ndarray:
-    """Writes a value and returns the applied one."""
-    return self.register.write(self.physics, value)
+  def check_values(self) -> None:
+    """Checks that the register stores values, saturates and refuses."""
+    register, spec = self._register, self._register.value_spec
+    self._require(
+        len({*register.PORTS}) == len(register.PORTS),
+        f'PORTS names a port twice: {register.PORTS}',
+    )
+    low, high = register.value_range
+    for value in self._values:
+      applied, reading = self._write(value), self._read()
+      self._require(
+          np.array_equal(applied, value), f'write({value}) returned {applied}'
+      )
+      for look in (applied, reading):
+        self._require(
+            type(look) in (np.ndarray, np.float64)
+            and (look.shape, look.dtype) == (spec.shape, np.float64),
+            f'{look!r}; values are float64 of the shape {spec.shape}',
+        )
+      self._require(_are_close(reading, value), f'{value} is read as {reading}')
+    for value in np.random.default_rng(0).uniform(low, high, _NUM_VALUES):
+      near = register.nearest(np.full(spec.shape, value)[()])
+      applied = self._write(np.full(spec.shape, value))
+      self._require(
+          np.array_equal(applied, near)
+          and np.array_equal(register.nearest(near), near),
+          f'write({value}) returned {applied}, and nearest {near}, for which it'
+          f' returns {register.nearest(near)}',
+      )
+    for beyond, bound in ((low - 1.0, low), (high + 1.0, high)):
+      applied = self._write(np.full(spec.shape, beyond))
+      self._require(
+          np.all(applied == bound) and _are_close(self._read(), bound),
+          f'{beyond} was applied as {applied}, not saturated to {bound}',
+      )
+    before = self._state()
+    for value in (np.nan, np.inf):
+      is_refused = False
+      try:
+        self._write(np.full(spec.shape, value))
+      except errors.RegisterValueError:
+        is_refused = True
+      self._require(is_refused, f'{value} is not refused')
+    self._require(
+        np.array_equal(self._state(), before),
+        'a refused value changes the world',
+    )
 
+  def check_looks(self) -> None:
+    """Checks that looks change nothing and stay what they were."""
+    register, physics = self._register, self._physics
+    self._write(self._values[1])
+    self._shove(np.random.default_rng(0))
+    physics.forward()
+    before = self._state()
+    without = register.read_without(physics, lambda geoms: geoms >= 0)
+    self._require(
+        without is None or np.array_equal(without, self._read()),
+        f'in an empty world, it reads {self._read()}, and {without} without'
+        ' what is in the way',
+    )
+    looks = [
+        self._read(),
+        register.applied(physics),
+        register.displacements(physics),
+        register.inspect(physics).permanent,
+    ]
+    self._require(
+        np.array_equal(self._state(), before),
+        'a look at the register changes the world',
+    )
+    kept = [np.copy(look) for look in looks]
+    self._write(self._values[-2])
+    self._require(
+        all(map(np.array_equal, looks, kept)), 'a later write changes a reading'
+    )
 
-def _where(register: registers.Register) -> str:
-  name = type(register).__name__
-  return f'{name}, {register.channel} with {type(register.blocks[0]).__name__}'
+  def _shove(self, generator: np.random.Generator) -> None:
+    """Pushes, lifts and turns every block of the register, at random."""
+    physics, most = self._physics, np.array([40, 40, 30, 2, 2, 2])
+    for block in self._register.blocks:
+      body = physics.model.geom_bodyid[physics.bind(block.geom).element_id]
+      force = generator.uniform(-most * [1, 1, 0, 1, 1, 1], most)
+      physics.data.xfrc_applied[body] = force * physics.model.body_mass[body]
+      physics.advance(8)
+      physics.data.xfrc_applied[body] = 0.0
+
+  def check_shoves(self) -> None:
+    """Checks what remains of the value when blocks are pushed."""
+    generator = np.random.default_rng(0)
+    value = self._values[2]
+    for _ in range(_NUM_SHOVES):
+      self._write(value)
+      reading = self._read()
+      self._shove(generator)
+      self._require(
+          self._register.channel == 'embedded'
+          or np.array_equal(self._read(), reading),
+          f'the reading changed from {reading} to {self._read()}',
+      )
+      before = self._register.inspect(self._physics).permanent
+      self._write(value)
+      after = self._register.inspect(self._physics)
+      self._require(
+          _are_close(after.temporary, 0.0),
+          f'a write leaves a temporary corruption of {after.temporary};'
+          ' _permanent returns what a write cannot undo',
+      )
+      self._require(
+          _are_close(after.permanent, before),
+          f'a write changes the permanent corruption from {before} to'
+          f' {after.permanent}',
+      )
+
+  def check_rest(self) -> None:
+    """Checks that physics alone changes no value."""
+    for value in self._values[:: _NUM_VALUES // 4]:
+      self._world.restart()
+      self._write(value)
+      self._physics.advance(_REST)
+      reading = self._read()
+      self._require(
+          np.allclose(reading, value, rtol=0, atol=_AT_REST),
+          f'{value} is read as {reading} after {_REST} substeps in which nobody'
+          ' has touched the blocks; keep them apart, or exclude their contact'
+          ' as two_block does',
+      )
+
+  def check_displacements(self) -> None:
+    """Checks the consequences of the motion of a single block."""
+    register = self._register
+    changed = np.zeros(register.value_spec.shape, bool)
+    for i, block in enumerate(register.blocks):
+      direction, named = block.direction, block.ports or register.PORTS
+      depends = np.array([port in named for port in register.PORTS] or True)
+      # A register of few levels may not notice less than the size of a block.
+      size = 2 * block.half_size
+      for way in (*_DIRECTIONS, *([direction] if direction else [])):
+        changed |= self._displaced(block, size * np.array(way)) != 0.0
+        difference = self._displaced(block, _MOVED * np.array(way))
+        reported = register.displacements(self._physics)[i]
+        self._require(
+            reported >= _LEAST,
+            f'block {i} was moved by {_MOVED} m in the direction {way}, and'
+            f' displacements reports {reported} m; override it',
+        )
+        self._require(
+            np.all(difference[~depends] == 0.0),
+            f'block {i} changes other ports than {named}',
+        )
+        changed |= difference != 0.0
+      self._require(
+          not direction or difference.max() > 0.0,
+          f'block {i} was moved in its direction {direction}, and the reading'
+          f' changed by {difference}; the direction of a block raises a'
+          ' reading',
+      )
+      changed |= self._displaced(block, np.zeros(2), turn=0.1) != 0.0
+    fixed = [p for i, p in enumerate(register.PORTS) if not changed[i]]
+    self._require(
+        changed.all(),
+        f'no motion of a single block changes {fixed or "the reading"}',
+    )
+
+  def _displaced(
+      self,
+      block: block_kinds.Block,
+      displacement: np.ndarray,
+      turn: float = 0.0,
+  ) -> np.ndarray:
+    """Displaces a block after a write.
+
+    Returns:
+      The change of the reading, without rounding errors.
+    """
+    self._world.restart()
+    self._write(self._values[2])
+    reading = self._read()
+    place = np.array(block.position(self._physics))
+    place[:2] += displacement
+    block.put(self._physics, place, block.heading(self._physics) + turn)
+    change = np.asarray(self._read() - reading)
+    return np.where(np.abs(change) > _ROUNDING, change, 0.0)
+
+  def check_restart(self) -> None:
+    """Checks that a reset undoes writes and pushes."""
+    self._world.restart()
+    before = self._state()
+    self._write(self._values[-1])
+    self._shove(np.random.default_rng(0))
+    self._world.restart()
+    self._require(
+        np.array_equal(self._state(), before),
+        'a reset does not restore everything',
+    )
+
+  def check_batch(self) -> None:
+    """Checks that worlds of a batch are written as they would be alone."""
+    self._world.restart()
+    batch = batch_physics.BatchPhysics(self._physics, _NUM_WORLDS, 1, False)
+    begun = np.tile(self._state(), (_NUM_WORLDS, 1))
+    batch.set_state(np.arange(_NUM_WORLDS), begun)
+    where = np.array([True, False, True])
+    first = self._values[-_NUM_WORLDS:]
+    second = self._values[1 : 1 + _NUM_WORLDS]
+    self._register.write(batch, first)
+    before = self._register.read(batch)
+    self._register.write(batch, second, where)
+    readings = self._register.read(batch)
+    self._require(
+        np.array_equal(readings[~where], before[~where]),
+        'a write to other worlds of a batch changes a world',
+    )
+    for i in np.flatnonzero(where):
+      self._world.restart()
+      self._write(first[i])
+      self._write(second[i])
+      alone = self._read()
+      self._require(
+          np.array_equal(readings[i], alone),
+          f'{second[i]} is read as {readings[i]} in a batch, and as {alone} in'
+          ' one world',
+      )
 
 
 def _are_close(first: Any, second: Any) -> bool:
   return np.allclose(first, second, rtol=0, atol=_ROUNDING)
-
-
-def _check_values(subject: _Subject) -> None:
-  """Checks that the register stores values, saturates and refuses."""
-  register, where = subject.register, subject.where
-  spec = register.value_spec
-  contracts.require(
-      len({*register.PORTS}) == len(register.PORTS),
-      f'{where}: PORTS names a port twice: {register.PORTS}',
-  )
-  low, high = register.value_range
-  for value in subject.values:
-    applied, reading = subject.write(value), subject.read()
-    contracts.require(
-        np.array_equal(applied, value),
-        f'{where}: write({value}) returned {applied}',
-    )
-    for look in (applied, reading):
-      contracts.require(
-          type(look) in (np.ndarray, np.float64)
-          and (look.shape, look.dtype) == (spec.shape, np.float64),
-          f'{where}: {look!r}; values are float64 of the shape {spec.shape}',
-      )
-    contracts.require(
-        _are_close(reading, value), f'{where}: {value} is read as {reading}'
-    )
-  for value in np.random.default_rng(0).uniform(low, high, _NUM_VALUES):
-    near = register.nearest(np.full(spec.shape, value)[()])
-    applied = subject.write(np.full(spec.shape, value))
-    contracts.require(
-        np.array_equal(applied, near)
-        and np.array_equal(register.nearest(near), near),
-        f'{where}: write({value}) returned {applied}, and nearest {near}, for'
-        f' which it returns {register.nearest(near)}',
-    )
-  for beyond, bound in ((low - 1.0, low), (high + 1.0, high)):
-    applied = subject.write(np.full(spec.shape, beyond))
-    contracts.require(
-        np.all(applied == bound) and _are_close(subject.read(), bound),
-        f'{where}: {beyond} was applied as {applied}, not saturated to {bound}',
-    )
-  before = snapshots.get_state(subject.physics)
-  for value in (np.nan, np.inf):
-    try:
-      subject.write(np.full(spec.shape, value))
-    except errors.RegisterValueError:
-      pass
-    else:
-      raise contracts.ContractError(f'{where}: {value} is not refused')
-  contracts.require(
-      np.array_equal(snapshots.get_state(subject.physics), before),
-      f'{where}: a refused value changes the world',
-  )
 
 
 def _check_wide_range(
@@ -259,186 +410,10 @@ def _check_wide_range(
     return
   [register, *_] = world.registers
   try:
-    _check_values(_Subject(register, world, _where(register)))
+    _Contract(register, world).check_values()
   except contracts.ContractError as error:
     raise contracts.ContractError(
         f'{error}; the range was [{low:g}, {high:g}]. A range with values that'
         ' the blocks cannot tell apart, such as angles of more than a turn, has'
         ' to be refused by a SpecError when the register is made'
     ) from error
-
-
-def _check_looks(subject: _Subject) -> None:
-  """Checks that looks change nothing and stay what they were."""
-  register, physics = subject.register, subject.physics
-  where = subject.where
-  subject.write(subject.values[1])
-  _shove(subject, np.random.default_rng(0))
-  physics.forward()
-  before = snapshots.get_state(physics)
-  without = register.read_without(physics, lambda geoms: geoms >= 0)
-  contracts.require(
-      without is None or np.array_equal(without, subject.read()),
-      f'{where}: in an empty world, it reads {subject.read()}, and {without}'
-      ' without what is in the way',
-  )
-  looks = [
-      subject.read(),
-      register.applied(physics),
-      register.displacements(physics),
-      register.inspect(physics).permanent,
-  ]
-  contracts.require(
-      np.array_equal(snapshots.get_state(physics), before),
-      f'{where}: a look at the register changes the world',
-  )
-  kept = [np.copy(look) for look in looks]
-  subject.write(subject.values[-2])
-  for look, was in zip(looks, kept, strict=True):
-    contracts.require(
-        np.array_equal(look, was), f'{where}: a later write changes a reading'
-    )
-
-
-def _shove(subject: _Subject, generator: np.random.Generator) -> None:
-  """Pushes, lifts and turns every block of a register, at random."""
-  physics = subject.physics
-  for block in subject.register.blocks:
-    body = physics.model.geom_bodyid[physics.bind(block.geom).element_id]
-    force = generator.uniform((-40, -40, 0, -2, -2, -2), (40, 40, 30, 2, 2, 2))
-    force *= physics.model.body_mass[body]
-    physics.data.xfrc_applied[body] = force
-    physics.advance(8)
-    physics.data.xfrc_applied[body] = 0.0
-
-
-def _check_shoves(subject: _Subject) -> None:
-  """Checks what remains of the value when blocks are pushed."""
-  register, physics = subject.register, subject.physics
-  where = subject.where
-  generator = np.random.default_rng(0)
-  value = subject.values[2]
-  for _ in range(_NUM_SHOVES):
-    subject.write(value)
-    reading = subject.read()
-    _shove(subject, generator)
-    if register.channel != 'embedded':
-      contracts.require(
-          np.array_equal(subject.read(), reading),
-          f'{where}: the reading changed from {reading} to {subject.read()}',
-      )
-    before = register.inspect(physics).permanent
-    subject.write(value)
-    after = register.inspect(physics)
-    contracts.require(
-        _are_close(after.temporary, 0.0),
-        f'{where}: a write leaves a temporary corruption of {after.temporary};'
-        ' _permanent returns what a write cannot undo',
-    )
-    contracts.require(
-        _are_close(after.permanent, before),
-        f'{where}: a write changes the permanent corruption from {before} to'
-        f' {after.permanent}',
-    )
-
-
-def _check_rest(subject: _Subject) -> None:
-  """Checks that physics alone changes no value."""
-  for value in subject.values[:: _NUM_VALUES // 4]:
-    subject.world.restart()
-    subject.write(value)
-    subject.physics.advance(_REST)
-    reading = subject.read()
-    contracts.require(
-        np.allclose(reading, value, rtol=0, atol=_AT_REST),
-        f'{subject.where}: {value} is read as {reading} after {_REST} substeps'
-        ' in which nobody has touched the blocks; keep them apart, or exclude'
-        ' their contact as two_block does',
-    )
-
-
-def _check_displacements(subject: _Subject) -> None:
-  """Checks the consequences of the motion of a single block."""
-  register, physics = subject.register, subject.physics
-  where = subject.where
-  changed = np.zeros(register.value_spec.shape, bool)
-  for i, block in enumerate(register.blocks):
-    direction, named = block.direction, block.ports or register.PORTS
-    depends = np.array([port in named for port in register.PORTS] or True)
-    # A register of few levels may not notice less than the size of a block.
-    size = 2 * block.half_size
-    for x, y in (*_DIRECTIONS, *([direction] if direction else [])):
-      far = _displaced(subject, block, (x * size, y * size))
-      changed |= np.abs(far) > _ROUNDING
-      difference = _displaced(subject, block, (_MOVED * x, _MOVED * y))
-      reported = register.displacements(physics)[i]
-      contracts.require(
-          reported >= _LEAST,
-          f'{where}: block {i} was moved by {_MOVED} m in the direction'
-          f' {(x, y)}, and displacements reports {reported} m; override it',
-      )
-      contracts.require(
-          _are_close(difference[~depends], 0.0),
-          f'{where}: block {i} changes other ports than {named}',
-      )
-      changed |= np.abs(difference) > _ROUNDING
-    if direction:
-      contracts.require(
-          difference.max() > _ROUNDING,
-          f'{where}: block {i} was moved in its direction {direction}, and the'
-          f' reading changed by {difference}; the direction of a block'
-          ' raises a reading',
-      )
-    changed |= np.abs(_displaced(subject, block, turn=0.1)) > _ROUNDING
-  fixed = [p for i, p in enumerate(register.PORTS) if not changed[i]]
-  contracts.require(
-      changed.all(),
-      f'{where}: no motion of a single block changes'
-      f' {fixed or "the reading"}',
-  )
-
-
-def _displaced(
-    subject: _Subject,
-    block: block_kinds.Block,
-    displacement: tuple[float, float] = (0.0, 0.0),
-    turn: float = 0.0,
-) -> np.ndarray:
-  """Displaces a block after a write; returns the change of the reading."""
-  subject.world.restart()
-  subject.write(subject.values[2])
-  reading = subject.read()
-  place = np.array(block.position(subject.physics))
-  place[:2] += displacement
-  block.put(subject.physics, place, block.heading(subject.physics) + turn)
-  return np.asarray(subject.read() - reading)
-
-
-def _check_batch(world: _World) -> None:
-  """Checks that worlds of a batch are written as they would be alone."""
-  world.restart()
-  batch = batch_physics.BatchPhysics(world.physics, _NUM_WORLDS, 1, False)
-  begun = np.tile(snapshots.get_state(world.physics), (_NUM_WORLDS, 1))
-  batch.set_state(np.arange(_NUM_WORLDS), begun)
-  where = np.array([True, False, True])
-  for register in world.registers:
-    subject = _Subject(register, world, _where(register))
-    values = subject.values[1 : 1 + _NUM_WORLDS]
-    register.write(batch, subject.values[-_NUM_WORLDS:])
-    before = register.read(batch)
-    register.write(batch, values, where)
-    readings = register.read(batch)
-    contracts.require(
-        np.array_equal(readings[~where], before[~where]),
-        f'{subject.where}: a write to other worlds of a batch changes a world',
-    )
-    for i in np.flatnonzero(where):
-      world.restart()
-      subject.write(subject.values[-_NUM_WORLDS:][i])
-      subject.write(values[i])
-      alone = subject.read()
-      contracts.require(
-          np.array_equal(readings[i], alone),
-          f'{subject.where}: {values[i]} is read as {readings[i]} in a batch,'
-          f' and as {alone} in one world',
-      )
