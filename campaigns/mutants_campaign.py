@@ -195,7 +195,7 @@ MUTANTS = [
     ),
     planting.Mutant(
         'contract', 'a register stores a value that is not finite', _CHECKS,
-        'if not is_finite.all():', 'if not is_finite.any() and False:', _REG,
+        'if is_finite.all():', 'if True:', _REG,
     ),
     planting.Mutant(
         'contract', 'a register does not saturate',

@@ -6,7 +6,7 @@ attributes. One copy of MuJoCo's integration state is therefore a snapshot of
 the whole episode, and a batch of worlds can share one entity.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 import contextlib
 import types
 from typing import Any, final
@@ -113,7 +113,7 @@ class Slot:
     """Finds the slot in the data of a physics and caches the result."""
     model = physics.model
     if model is not self._model:
-      start = _cached_layout(model).get(self._numeric.full_identifier)
+      start = layout(model).get(self._numeric.full_identifier)
       if start is None:
         raise errors.StateLayoutError(
             f'{self._numeric.full_identifier}: not in the compiled model;'
@@ -184,7 +184,7 @@ def room_for_slots(mjcf_model: mjcf.RootElement) -> Iterator[None]:
     mjcf_model.size.nuserdata = before
 
 
-def layout(model: Any) -> dict[str, int]:
+def layout(model: Any) -> Mapping[str, int]:
   """Returns the first `userdata` index of each slot, by its full name.
 
   Args:
@@ -193,10 +193,6 @@ def layout(model: Any) -> dict[str, int]:
   Raises:
     StateLayoutError: If the slots need more numbers than the model has.
   """
-  return dict(_cached_layout(model))
-
-
-def _cached_layout(model: Any) -> dict[str, int]:
   if model in _layouts:
     return _layouts[model]
   starts, end = {}, 0

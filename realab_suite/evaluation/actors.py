@@ -88,7 +88,10 @@ class PolicyRunner(abc.ABC):  # noqa: B024 - A subclass begins episodes.
     self._policy = policy = policy.in_action_set(env.action_set)
     mechanism = env.mechanism
     design = mechanism.design
-    self._action_set, self._indices = translation(policy, design)
+    self._action_set = policy.action_set
+    if (spec := design.action_set) is not None:
+      self._action_set = action_sets.get(spec.name, spec.version)
+    self._indices = policy.action_set.translation(self._action_set)
     self._queries = Queries(mechanism, len(self._action_set))
     self._dtype = env.action_spec().dtype
     if queries is None:
@@ -97,8 +100,11 @@ class PolicyRunner(abc.ABC):  # noqa: B024 - A subclass begins episodes.
     self._holds_taken = [one.name in queries for one in mechanism.queries]
     self._table = None
     if design.action_set is None:
-      names, number = env.action_spec().name, self._queries.number
-      self._table = action_table(self._action_set, names, number)
+      names = (env.action_spec().name or '').split('\t')
+      elements = names[self._queries.number :]
+      self._table = self._action_set.table(
+          tuple(name.rpartition('/')[2] for name in elements)
+      )
 
   def _begin(self, keys: np.ndarray, query_keys: np.ndarray) -> None:
     """Begins an episode in each world, with random keys, `(..., 2)`."""
@@ -271,46 +277,6 @@ def query_policy(design: specs.DesignSpec) -> str:
         f' be one of {list(_QUERY_POLICIES)}'
     )
   return str(name)
-
-
-def translation(
-    policy: policies.Policy, design: specs.DesignSpec
-) -> tuple[action_sets.ActionSet, np.ndarray]:
-  """Returns the action set in which a policy acts, and its actions in it.
-
-  Args:
-    policy: The policy.
-    design: Design of the environment.
-
-  Returns:
-    The action set of the design, or without one that of the policy; and the
-    index in it of each action of the policy, `(actions,)` int32.
-
-  Raises:
-    SpecError: If the design's action set lacks an action of the policy.
-  """
-  action_set, spec = policy.action_set, design.action_set
-  if spec is None:
-    return action_set, action_set.translation(action_set)
-  expected = action_sets.get(spec.name, spec.version)
-  return expected, action_set.translation(expected)
-
-
-def action_table(
-    action_set: action_sets.ActionSet, names: str | None, num_queries: int
-) -> np.ndarray:
-  """Returns the control vector of every action, `(actions, elements)`.
-
-  Args:
-    action_set: The actions.
-    names: Tab-separated element names of the environment's action spec.
-    num_queries: Number of leading elements that are queries, and left out.
-
-  Raises:
-    SpecError: If the environment lacks a control element.
-  """
-  elements = (names or '').split('\t')[num_queries:]
-  return action_set.table(tuple(name.rpartition('/')[2] for name in elements))
 
 
 def make(

@@ -28,7 +28,6 @@ def evaluate(
     *,
     first_episode: int = 0,
     sinks: Sequence[events.EventSink] = (),
-    on_episode: Callable[[results.EpisodeResult], None] | None = None,
     objective: objectives.ObjectiveSpec | None = None,
 ) -> list[results.EpisodeResult]:
   """Runs a policy for a number of episodes.
@@ -43,8 +42,6 @@ def evaluate(
     num_episodes: Number of episodes to run.
     first_episode: Number of the first episode.
     sinks: Additional event sinks, for example a film recorder.
-    on_episode: Function that is called with the result of each episode when it
-      ends.
     objective: Objective in place of that of the design, or `None`.
 
   Returns:
@@ -73,7 +70,6 @@ def evaluate(
       num_episodes,
       first_episode=first_episode,
       sinks=sinks,
-      on_episode=on_episode,
       objective=objective,
   )
 
@@ -85,7 +81,6 @@ def results_of(
     *,
     first_episode: int = 0,
     sinks: Sequence[events.EventSink] = (),
-    on_episode: Callable[[results.EpisodeResult], None] | None = None,
     objective: objectives.ObjectiveSpec | None = None,
 ) -> list[results.EpisodeResult]:
   """Returns the results of episodes that a function plays.
@@ -94,10 +89,9 @@ def results_of(
     env: The environment.
     play: Function from the number of an episode, that resets `env` and acts
       until the episode ends.
-    num_episodes: As in `evaluate`; so are the next three.
+    num_episodes: As in `evaluate`; so are the next two.
     first_episode: Number of the first episode.
     sinks: Additional event sinks.
-    on_episode: Function that is called with each result.
     objective: As in `evaluate`.
 
   Returns:
@@ -125,10 +119,7 @@ def results_of(
     while len(ended) < num_episodes:
       play(first_episode + len(ended))
       # There may be several, if a policy or a wrapper resets the environment.
-      for result in monitor.take()[: num_episodes - len(ended)]:
-        ended.append(result)
-        if on_episode is not None:
-          on_episode(result)
+      ended += monitor.take()[: num_episodes - len(ended)]
   finally:
     for sink in added:
       env.remove_sink(sink)

@@ -70,22 +70,6 @@ def find_place(
   return named_places[place]
 
 
-def own_place(design: specs.DesignSpec, name: str) -> arenas.Place | None:
-  """Returns the place of a register if it needs nothing of the world.
-
-  Args:
-    design: Design that contains the register.
-    name: Name of the register.
-
-  Returns:
-    `None` for a named place.
-  """
-  place = design.registers[name].place
-  if isinstance(place, str):
-    return None
-  return find_place(name, place, {})
-
-
 def attach(
     register: base.Register, root: composer.Entity, place: arenas.Place
 ) -> None:

@@ -113,9 +113,9 @@ class FeedbackMechanism(modelled.ModelledEntity):
         self, num_substeps
     )
     for name, register in self._registers.items():
-      place = assembly.own_place(design, name)
-      if place is not None:
-        assembly.attach(register, self, place)
+      place = design.registers[name].place
+      if not isinstance(place, str):
+        assembly.attach(register, self, assembly.find_place(name, place, {}))
 
   def _build_observables(self) -> composer.Observables:
     """Returns the readings of registers that agents read, by port.

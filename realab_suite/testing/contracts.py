@@ -5,6 +5,8 @@ from typing import Any, final
 
 import numpy as np
 
+from realab_suite import trees
+
 
 @final
 class ContractError(AssertionError):
@@ -44,12 +46,8 @@ def require_same(
   )
   for name, value in expected.items():
     array, wanted = np.asarray(given[name]), np.asarray(value)
-    is_same = (
-        array.shape == wanted.shape
-        and array.dtype == wanted.dtype
-        and array.tobytes() == wanted.tobytes()
-    )
-    if not is_same:  # To print arrays takes longer than to compare them.
+    # To print arrays takes longer than to compare them.
+    if not trees.are_equal(array, wanted):
       raise ContractError(
           f'{breach}: {name!r} is {array!s:.200}; it was {wanted!s:.200}'
       )

@@ -127,15 +127,14 @@ def _number(
   return float(np.clip(0.0, *low_high)) if step in _ZEROS else number
 
 
-def _together(of_worlds: Sequence[_Inputs]) -> _Inputs:
-  """Returns the inputs of a batch."""
-  observation, readings, start, key = zip(*of_worlds, strict=True)
-  return _stack(observation), _stack(readings), _stack(start), _stack(key)
-
-
-def _stack(parts: Sequence[Any]) -> Any:
+def _together(parts: Sequence[Any]) -> Any:
+  """Returns the inputs of a batch from those of its worlds."""
+  if isinstance(parts[0], tuple):
+    return tuple(map(_together, zip(*parts, strict=True)))
   if isinstance(parts[0], dict):
-    return {key: np.stack([part[key] for part in parts]) for key in parts[0]}
+    return {
+        name: _together([part[name] for part in parts]) for name in parts[0]
+    }
   return np.stack(parts)
 
 

@@ -37,8 +37,17 @@ def refuse_infinite(value: np.ndarray, name: str, ports: Sequence[str]) -> None:
     RegisterValueError: If a value is not finite.
   """
   is_finite = np.isfinite(value)
-  if not is_finite.all():
-    raise _refusal(name, value, ~is_finite, 'must be finite', ports)
+  if is_finite.all():
+    return
+  first = np.unravel_index(int(np.argmin(is_finite)), np.shape(value))
+  worlds = first[:-1] if ports else first
+  if ports:
+    name = f'{name}_{ports[int(first[-1])]}'
+  raise errors.RegisterValueError(
+      f'register {name!r}: cannot store {np.asarray(value)[first]}; must be'
+      ' finite',
+      int(worlds[0]) if worlds else None,
+  )
 
 
 def start_value(
@@ -67,32 +76,6 @@ def start_value(
         f' {type(error).__name__}: {error}; must be numbers of the shape'
         f' {shape}'
     ) from error
-
-
-def _refusal(
-    name: str,
-    value: np.ndarray,
-    is_wrong: np.ndarray,
-    rule: str,
-    ports: Sequence[str] = (),
-) -> errors.RegisterValueError:
-  """Returns an error for the first wrong value.
-
-  Args:
-    name: Name of the register.
-    value: Values, `(...)`, or `(..., ports)`.
-    is_wrong: True for each wrong value, bool of the same shape.
-    rule: Rule that the value breaks.
-    ports: Names of the ports of the register.
-  """
-  first = np.unravel_index(int(np.argmax(is_wrong)), np.shape(value))
-  worlds = first[:-1] if ports else first
-  if ports:
-    name = f'{name}_{ports[int(first[-1])]}'
-  return errors.RegisterValueError(
-      f'register {name!r}: cannot store {np.asarray(value)[first]}; {rule}',
-      int(worlds[0]) if worlds else None,
-  )
 
 
 def misreading(
