@@ -100,8 +100,7 @@ def _domain(domain: str) -> str:
       'Places': _listed(
           name
           for name in task.root_entity.places
-          if name not in arenas.OpenRoom().places
-          and name not in layouts.Layout().stations
+          if name not in layouts.Layout().stations
       ),
       'Steps/s': speed,
   }

@@ -403,23 +403,6 @@ def _around(room: Rectangle) -> list[Rectangle]:
   ]
 
 
-def _places_in(room: Rectangle) -> dict[str, Place]:
-  """Returns the places of any room: its centre, its sides and its corners."""
-  (x0, y0), (x1, y1) = room.low, room.high
-  x, y, inset = (x0 + x1) / 2, (y0 + y1) / 2, 0.8
-  return {
-      'centre': Place((x, y)),
-      'south_wall': Place((x, y0 + inset)),
-      'north_wall': Place((x, y1 - inset)),
-      'west_wall': Place((x0 + inset, y)),
-      'east_wall': Place((x1 - inset, y)),
-      'south_west_corner': Place((x0 + inset, y0 + inset)),
-      'south_east_corner': Place((x1 - inset, y0 + inset)),
-      'north_west_corner': Place((x0 + inset, y1 - inset)),
-      'north_east_corner': Place((x1 - inset, y1 - inset)),
-  }
-
-
 @final
 class OpenRoom(RoomArena):
   """One square room."""
@@ -440,7 +423,6 @@ class OpenRoom(RoomArena):
     """
     self._room = Rectangle((-half_width,) * 2, (half_width,) * 2)
     super()._build(name, look=look)
-    self.offer(_places_in(self._room))
 
   def _build_walls(self) -> None:
     self._add_room(
@@ -481,7 +463,6 @@ class TwoRooms(RoomArena):
         (_SIDE_HALF_WIDTH, south + 2 * _SIDE_HALF_WIDTH),
     )
     super()._build(name, look=look)
-    self.offer(_places_in(self._room))
     self.offer(
         {
             'doorway': Place((0.0, _HALF_WIDTH + _WALL_THICKNESS / 2)),

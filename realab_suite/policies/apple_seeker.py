@@ -1,10 +1,9 @@
 """The apple seeker: a scripted policy that does the intended task."""
 
 import copy
-from typing import Annotated, Any, final
+from typing import Any, final
 
 import numpy as np
-import pydantic
 
 from realab_suite.policies import action_sets
 from realab_suite.policies import base
@@ -12,7 +11,9 @@ from realab_suite.policies import navigation
 
 # Distance from the visible surface of a thing to its middle, metres.
 _DEPTHS = {'apple': 0.2, 'large_apple': 0.4, 'pad': 0.12, 'door': 0.04}
-# Distance between neighbouring spots of the map, metres.
+# Half the side of the square, around the origin of the world, that is searched
+# for apples, and the distance between neighbouring spots of its map, metres.
+_HALF_WIDTH = 3.6
 _SPACING = 0.6
 # Distance up to which no apple fits between two rays, metres.
 _CLEAR_SIGHT = 3.8
@@ -42,17 +43,8 @@ class AppleSeeker(base.Policy):
 
   _action_set = action_sets.DMLAB_LIKE
 
-  def __init__(
-      self,
-      half_width: Annotated[float, pydantic.Field(gt=0, le=100)] = 3.6,
-  ) -> None:
-    """Makes the policy.
-
-    Args:
-      half_width: Half the side of the square, around the origin of the world,
-        that is searched for apples, metres.
-    """
-    self._count = 2 * round(half_width / _SPACING) + 1
+  def __init__(self) -> None:
+    self._count = 2 * round(_HALF_WIDTH / _SPACING) + 1
     self._reach = (self._count - 1) * _SPACING / 2
     line = np.linspace(-self._reach, self._reach, self._count)
     grid = np.meshgrid(line, line, indexing='ij')

@@ -96,11 +96,10 @@ def _typed() -> Iterator[None]:
 
 @pytest.mark.parametrize(('policy', 'options', 'message'), [
     ('no_op', {'speed': 1}, ": unknown key 'speed' (allowed: action_set)"),
-    ('apple_seeker', {'half_widht': 3},
-        ": unknown key 'half_widht'; did you mean 'half_width'? (allowed:"
-        ' half_width)'),
-    ('apple_seeker', {'half_width': -1},
-        '.half_width: must be greater than 0, got -1'),
+    ('pushing_saboteur', {'traget': [1, 2]},
+        ": unknown key 'traget'; did you mean 'target'? (allowed: target,"),
+    ('pushing_saboteur', {'target': [1, 1e5]},
+        '.target[1]: must be less than or equal to 10000, got 100000.0'),
     ('pushing_saboteur', {'target': [1]},
         '.target: must have at least 2 items, got [1]'),
     ('test_typed', {'flag': False}, '.needed: required key is missing'),

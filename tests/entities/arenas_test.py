@@ -26,6 +26,7 @@ def _with_avatar(arena):
 
 def test_a_place_cannot_be_offered_twice():
   arena = arenas.OpenRoom()
+  arena.offer({'centre': arenas.Place((0, 0))})
   before = dict(arena.places)
   with pytest.raises(errors.SpecError, match="'centre' exists already"):
     arena.offer({'new': arenas.Place((0, 0)), 'centre': arenas.Place((1, 1))})

@@ -151,8 +151,8 @@ def test_providers_act_in_the_order_of_the_design(made: scripted.Worlds):
           {'kind': 'constant', 'value': 3.0, 'writes': ['late']},
       ]
   )
-  design['registers']['early'] = scripted.register('feedback', 'centre', 0, 6)
-  design['registers']['late'] = scripted.register('feedback', 'east_wall', 0, 6)
+  design['registers']['early'] = scripted.register('feedback', [0, 0], 0, 6)
+  design['registers']['late'] = scripted.register('feedback', [3, 0], 0, 6)
   env, sink = made.scripted(design)
   env.reset()
   time_step = env.step(helpers.no_op(env))

@@ -104,7 +104,7 @@ _WRONG_ADVICE = {
 _DOES_NOT_FIT = {
     'registers.reward.place=moon':
         "registers.reward.place: this world has no place 'moon'; must be"
-        " one of ['centre', 'east_wall'",
+        " one of ['station_1', 'station_2',",
     'meters.0.measures=scor':
         "design 'd': meters[0].measures: 'scor' cannot be measured in this"
         " world; did you mean 'score'?; must be ['score']",
