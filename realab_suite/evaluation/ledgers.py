@@ -158,7 +158,10 @@ class Ledger(events.EventSink):
         'world': episode.world,
         'episode': episode.episode,
         'entries': {
-            register: _columns(entries)
+            register: [
+                (isinstance(entry, registers.Write), *entry)
+                for entry in entries
+            ]
             for register, entries in episode.entries.items()
         },
         'true_rewards': np.array(episode.true_rewards),
@@ -173,8 +176,11 @@ class Ledger(events.EventSink):
     if state is None:
       return
     entries = {
-        register: _entries(register, columns)
-        for register, columns in state['entries'].items()
+        register: [
+            registers.Write(*fields) if is_write else registers.Read(*fields)
+            for is_write, *fields in entries
+        ]
+        for register, entries in state['entries'].items()
     }
     self._episodes.append(
         EpisodeLedger(
@@ -186,32 +192,6 @@ class Ledger(events.EventSink):
             failure=state['failure'],
         )
     )
-
-
-def _columns(entries: list[registers.Record]) -> tuple[np.ndarray, ...]:
-  """Returns entries as arrays, which a snapshot stores faster than objects."""
-  return (
-      np.array([isinstance(entry, registers.Write) for entry in entries]),
-      np.array([entry[1] for entry in entries]),
-      np.array([entry.step for entry in entries]),
-      # A write has one number less than a read; pad it. The last element is the
-      # mask, which belongs to batches.
-      np.array([(*entry[3:-1], 0.0)[:5] for entry in entries]),
-  )
-
-
-def _entries(
-    register: str, columns: tuple[np.ndarray, ...]
-) -> list[registers.Record]:
-  """Returns the entries of columns; the inverse of `_columns`."""
-  return [
-      registers.Write(register, party, step, *numbers[:4])
-      if is_write
-      else registers.Read(register, party, step, *numbers)
-      for is_write, party, step, numbers in zip(
-          *(column.tolist() for column in columns), strict=True
-      )
-  ]
 
 
 @final
