@@ -4,9 +4,8 @@ The module contains the base class of specs, but no spec.
 """
 
 import abc
-import bisect
 from collections.abc import Collection, Mapping, Sequence
-import functools
+import contextlib
 import hashlib
 import json
 import re
@@ -196,35 +195,27 @@ def validate(
     if are_overrides_free:
       free = loading.texts_in_overrides(overrides)
 
-  @functools.cache
-  def judged(count: int) -> tuple[_Model | None, list[str]]:
-    """Returns the model with the first `count` overrides, or its problems."""
-    used = overrides[:count]
-    changed = loading.apply_overrides(data, used) if used else data
+  def problems_of(changed: Mapping[str, Any]) -> list[str]:
     try:
-      return model_class.model_validate(changed, context=free), []
+      model_class.model_validate(changed, context=free)
     except pydantic.ValidationError as error:
-      return None, _problems(error, changed)
+      return _problems(error, changed)
+    return []
 
-  def is_worse(count: int) -> bool:
-    """Returns True if the data has problems that overrides add."""
-    return not set(judged(count)[1]) <= set(judged(0)[1])
-
-  model, _ = judged(len(overrides))
-  if model is not None:
-    return model
-  # A file may have many overrides, so not every number of them is tried.
-  count = 0
-  if is_worse(len(overrides)):
-    count = bisect.bisect(range(len(overrides)), False, lo=1, key=is_worse)
-    if judged(count - 1)[0] is None:
-      count = 0  # The data is wrong without the override, too.
-  hint = ''
-  if count:
-    override = overrides[count - 1]
-    where = loading.override_name(override)
-    hint = loading.hint_at_keys(override, data)
-  problems = judged(count)[1]
+  changed = loading.apply_overrides(data, overrides) if overrides else data
+  with contextlib.suppress(pydantic.ValidationError):
+    return model_class.model_validate(changed, context=free)
+  before = problems = problems_of(data)
+  hint, changed = '', data
+  for override in overrides:
+    changed = loading.apply_overrides(changed, [override])
+    after = problems_of(changed)
+    if not set(after) <= set(problems):
+      if not before:  # Otherwise, the data is wrong without the override, too.
+        problems, where = after, loading.override_name(override)
+        hint = loading.hint_at_keys(override, data)
+      break
+    before = after
   texts = problems[:_MAX_TOLD]
   if len(problems) > _MAX_TOLD:
     texts.append(f'and {len(problems) - _MAX_TOLD} more')

@@ -7,7 +7,6 @@ from typing import Any
 import pytest
 
 from realab_suite import suite
-from realab_suite.config import loading
 from realab_suite.feedback import specs
 from realab_suite.lab.experiments import experiment_specs
 from tests.config import refusals
@@ -107,25 +106,6 @@ def test_an_override_replaces_a_wrong_value_of_the_file():
   assert specs.load(wrong, ('dof=planar',)).dof == 'planar'
   text = _refusal(wrong, 'dof=planar', 'dof=free', 'dof=loose', 'name=e')
   assert text.startswith("override 'dof=loose': ")
-
-
-def test_few_of_many_overrides_are_judged_to_find_the_wrong_one(monkeypatch):
-  applied = []
-  apply = loading.apply_overrides
-
-  def counted(data, overrides):
-    applied.append(len(overrides))
-    return apply(data, overrides)
-
-  monkeypatch.setattr(loading, 'apply_overrides', counted)
-  right = ['dof=planar'] * 255
-  for position in (0, 100, 255):
-    overrides = [*right[:position], 'dof=loose', 'bad=1', *right[position:]]
-    text = _refusal(_DESIGN, *overrides)
-    assert text.startswith("override 'dof=loose': dof: must be")
-    wrong = _changed(dof='fixed', action_set='none')
-    assert _refusal(wrong, *overrides).startswith('design: dof: must be')
-  assert len(applied) <= 6 * 10
 
 
 def test_of_two_overrides_that_contradict_each_other_the_later_is_named():
