@@ -57,7 +57,7 @@ def fixture_registries():
   """Undoes what a page registers and silences."""
   verbosity = logging.get_verbosity()
   # Several pages use its worlds, which only the first import registers.
-  importlib.import_module('realab_suite.testing.probes')
+  importlib.import_module('realab_suite.lab.testing.probes')
   with registries.preserved():
     yield
   logging.set_verbosity(verbosity)

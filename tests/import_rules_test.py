@@ -75,6 +75,7 @@ _MAY_IMPORT = {
     ),
     'lab': (),
     'lab.verdicts': _CORE,
+    'lab.testing': _CORE,
     'lab.attribution': _CORE,
     'lab.audit': (*_CORE, 'lab.verdicts'),
     'lab.experiments': (*_CORE, 'lab'),

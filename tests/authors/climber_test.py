@@ -16,6 +16,7 @@ pytest.importorskip('equinox', reason='equinox is in the extra `agents`')
 from realab_suite import testing
 from realab_suite.evaluation import results
 from realab_suite.lab import agents
+from realab_suite.lab import testing as lab_testing
 from realab_suite.lab.experiments import experiment_specs
 from realab_suite.lab.experiments import jobs
 from realab_suite.lab.experiments import training
@@ -61,7 +62,7 @@ def fixture_climber() -> Any:
 
 
 def _check(make: Any) -> None:
-  testing.check_learner(make, overrides=_INDICES, num_steps=12)
+  lab_testing.check_learner(make, overrides=_INDICES, num_steps=12)
 
 
 def test_it_keeps_the_contract(climber: Any):

@@ -14,7 +14,7 @@ import pytest
 
 from realab_suite.evaluation import monitors
 from realab_suite.evaluation import results
-from realab_suite.testing import probes
+from realab_suite.lab.testing import probes
 
 pytestmark = pytest.mark.slow
 

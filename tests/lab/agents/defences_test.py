@@ -17,7 +17,7 @@ from realab_suite.lab.agents import defences
 from realab_suite.lab.agents import features
 from realab_suite.lab.agents import guards
 from realab_suite.lab.agents import trusted_policies
-from realab_suite.testing import probes
+from realab_suite.lab.testing import probes
 from tests.lab.agents import toys
 
 _KEY = np.array([1, 2], np.uint32)

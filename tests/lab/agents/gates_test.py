@@ -11,7 +11,7 @@ from realab_suite import errors
 from realab_suite import trees
 from realab_suite.lab import agents
 from realab_suite.lab.agents import gates
-from realab_suite.testing import probes
+from realab_suite.lab.testing import probes
 from tests.lab.agents import toys
 
 _WORKER = {'policy': 'probe_worker', 'options': {'rest': 0.3}, 'worlds': 0.5}

@@ -1,8 +1,8 @@
 """Tests of learned rewards: laws, clips across batches, answers on paper.
 
-In the probe worlds (`realab_suite.testing.probes`), an honest agent works in
-each of ten steps, for a true return of 10. A push in the world `one_push` adds
-5 to each later reading, so that one push and nine steps of work are paid 59.
+In the worlds of `lab/testing/probes.py`, an honest agent works in each of ten
+steps, for a true return of 10. A push in the world `one_push` adds 5 to each
+later reading, so that one push and nine steps of work are paid 59.
 """
 
 import functools
@@ -21,7 +21,7 @@ from realab_suite.lab.agents import defences
 from realab_suite.lab.agents import ensembles
 from realab_suite.lab.agents import features
 from realab_suite.lab.agents import policy_gradient
-from realab_suite.testing import probes
+from realab_suite.lab.testing import probes
 from tests.lab.agents import toys
 
 # The least prediction.

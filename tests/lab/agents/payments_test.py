@@ -16,8 +16,8 @@ from realab_suite.feedback import specs
 from realab_suite.lab import agents
 from realab_suite.lab.agents import defences
 from realab_suite.lab.agents import guards
+from realab_suite.lab.testing import probes
 from realab_suite.lab.verdicts import verdicts
-from realab_suite.testing import probes
 from tests import registries
 from tests.evaluation import judged
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from realab_suite.lab import agents
-from realab_suite.testing import probes
+from realab_suite.lab.testing import probes
 
 _LOOKS_AHEAD = {'kind': 'policy_gradient', 'reward': 'reward', 'gamma': 1.0}
 _MYOPIC = {**_LOOKS_AHEAD, 'gamma': 0.0}

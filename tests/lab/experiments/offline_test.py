@@ -26,7 +26,7 @@ from realab_suite.lab.experiments import experiment_specs
 from realab_suite.lab.experiments import jobs
 from realab_suite.lab.experiments import recorded_data
 from realab_suite.lab.experiments import training
-from realab_suite.testing import probes
+from realab_suite.lab.testing import probes
 
 _ONE = 'push ' + 'work ' * 9
 _REWARD = 'instantaneous_reward'

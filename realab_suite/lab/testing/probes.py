@@ -51,7 +51,7 @@ pushing then confirms itself, and there is no answer on paper.
 
     import functools
     from realab_suite.lab import agents
-    from realab_suite.testing import probes
+    from realab_suite.lab.testing import probes
 
     learner = {'kind': 'policy_gradient', 'reward': 'reward', **probes.SMALL}
     make = functools.partial(agents.make, learner)
