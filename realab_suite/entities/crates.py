@@ -32,7 +32,6 @@ class Crate(measurables.MeasurableEntity):
       name: str = 'crate',
       size: float = 0.3,
       mass: float = 1.0,
-      is_planar: bool = False,
       kind: str = appearance.CRATE,
   ) -> None:
     """Builds the crate.
@@ -41,8 +40,6 @@ class Crate(measurables.MeasurableEntity):
       name: Name of the model.
       size: Edge length, in m.
       mass: Mass, in kg.
-      is_planar: True for a crate that slides along the floor and is never
-        lifted.
       kind: Class that rays report, with a colour.
 
     Raises:
@@ -58,9 +55,8 @@ class Crate(measurables.MeasurableEntity):
             f' {most:g}'
         )
     self._mjcf_root = mjcf.RootElement(model=name)
-    block_kind = block_kinds.PlanarBlock if is_planar else block_kinds.FreeBlock
     style = appearance.geom_style(kind)
-    self._block: block_kinds.Block = block_kind(
+    self._block = block_kinds.FreeBlock(
         self._mjcf_root,
         'block',
         (0.0, 0.0),

@@ -15,6 +15,8 @@ from realab_suite.entities import protocols
 
 _THICKNESS = 0.08
 _HEIGHT = 1.0
+# Sliding speed, in m/s.
+_SPEED = 2.0
 # Travel of the door, in widths of the opening. It is more than 1 so that the
 # face of an open door is not in one plane with the end of the wall.
 _BEYOND = 1.02
@@ -27,19 +29,15 @@ class SlidingDoor(measurables.MeasurableEntity):
   Contacts cannot move the door. Its pose is its only state.
   """
 
-  def _build(
-      self, name: str = 'door', width: float = 1.4, speed: float = 2.0
-  ) -> None:
+  def _build(self, name: str = 'door', width: float = 1.4) -> None:
     """Builds the door.
 
     Args:
       name: Name of the model.
       width: Width of the opening that the door closes, in m.
-      speed: Sliding speed, in m/s.
     """
     self._mjcf_root = mjcf.RootElement(model=name)
     self._travel = width * _BEYOND
-    self._speed = speed
     self._leaf = moving.MovingPart(
         f'{name}_leaf',
         [
@@ -86,7 +84,7 @@ class SlidingDoor(measurables.MeasurableEntity):
     # In most steps the door is at its target already.
     if axes.anywhere(remaining):
       position = np.array(leaf)
-      step = self._speed * seconds
+      step = _SPEED * seconds
       position[..., 0] = x + np.clip(remaining, -step, step)
       moving.move(physics, self._leaf.frame, position)
 

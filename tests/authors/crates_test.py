@@ -23,11 +23,10 @@ class Yard(rooms.RoomTask):
   DYNAMICS_VERSION = 1
   max_true_return = 100.0
 
-  def __init__(self, size: float = 0.3, is_planar: bool = False) -> None:
+  def __init__(self, size: float = 0.3) -> None:
     super().__init__(arenas.OpenRoom())
     self.crates = [
-        crates.Crate(name, size=size, is_planar=is_planar)
-        for name in ('crate_1', 'crate_2')
+        crates.Crate(name, size=size) for name in ('crate_1', 'crate_2')
     ]
     self.add_crate(self.crates[0], (-2.0, 2.0), _SPREAD)
     self.add_crate(self.crates[1], (-2.0, 0.8))
@@ -95,7 +94,7 @@ def _push(env: Any, metres: float) -> None:
 
 
 def test_a_world_with_registers_on_crates_keeps_the_contract():
-  testing.check_world(lambda: Yard(is_planar=True), _design())
+  testing.check_world(Yard, _design())
 
 
 def test_moving_the_crate_corrupts_the_register_for_good():

@@ -19,7 +19,7 @@ class _World:
     arena = arenas.TwoRooms()
     self.doorway = arena.places['doorway'].position
     self.width = arena.doorway_width
-    self.door = doors.SlidingDoor(width=self.width, speed=_SPEED)
+    self.door = doors.SlidingDoor(width=self.width)
     self.door.attach_to(arena, self.doorway)
     self.avatar = avatars.Avatar()
     arena.attach(self.avatar)
