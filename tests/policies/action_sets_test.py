@@ -10,8 +10,8 @@ from realab_suite import suite
 from realab_suite.engine import batch_environment
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import batch_actors
+from realab_suite.lab.audit import macros
 from realab_suite.policies import action_sets
-from realab_suite.policies import macros
 from realab_suite.policies import simple
 from realab_suite.tasks import collect_apples
 from tests import registries

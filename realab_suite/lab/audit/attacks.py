@@ -6,7 +6,7 @@ from typing import NamedTuple, final
 import numpy as np
 
 from realab_suite.lab.audit import aiming
-from realab_suite.policies import macros
+from realab_suite.lab.audit import macros
 
 # Number of macro-actions of a sequence.
 _LENGTH = 3

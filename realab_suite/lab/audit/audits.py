@@ -22,12 +22,12 @@ from realab_suite.lab.audit import aiming
 from realab_suite.lab.audit import attacks
 from realab_suite.lab.audit import episodes
 from realab_suite.lab.audit import findings
+from realab_suite.lab.audit import macros
 from realab_suite.lab.audit import searches
 from realab_suite.lab.verdicts import hacking
 from realab_suite.lab.verdicts import intervals
 from realab_suite.lab.verdicts import judging
 from realab_suite.lab.verdicts import stakes
-from realab_suite.policies import macros
 
 # Number of worlds of a comparison, and of its repetition if it finds hacked
 # episodes, but too few to be sure.

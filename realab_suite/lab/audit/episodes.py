@@ -13,7 +13,7 @@ from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import results
 from realab_suite.lab.audit import aiming
-from realab_suite.policies import macros
+from realab_suite.lab.audit import macros
 
 
 @final

@@ -14,11 +14,11 @@ from realab_suite.feedback import objectives
 from realab_suite.feedback import specs
 from realab_suite.lab.audit import aiming
 from realab_suite.lab.audit import episodes
+from realab_suite.lab.audit import macros
 from realab_suite.lab.verdicts import hacking
 from realab_suite.lab.verdicts import intervals
 from realab_suite.lab.verdicts import stakes
 from realab_suite.lab.verdicts import verdicts
-from realab_suite.policies import macros
 
 EXPLOITABLE: Final = 'EXPLOITABLE'
 RESISTED: Final = 'RESISTED WITHIN BUDGET'

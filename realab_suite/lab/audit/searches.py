@@ -8,9 +8,9 @@ import numpy as np
 from realab_suite.evaluation import results
 from realab_suite.lab.audit import attacks
 from realab_suite.lab.audit import episodes
+from realab_suite.lab.audit import macros
 from realab_suite.lab.verdicts import hacking
 from realab_suite.lab.verdicts import stakes
-from realab_suite.policies import macros
 
 DEFAULT_BUDGET: Final = 1200
 """Default number of episodes of a search; more if the design needs more."""

@@ -13,7 +13,7 @@ from realab_suite.entities import appearance
 from realab_suite.evaluation import actors
 from realab_suite.feedback import specs
 from realab_suite.lab.audit import aiming
-from realab_suite.policies import macros
+from realab_suite.lab.audit import macros
 from realab_suite.policies import simple
 from tests.lab.audit import designs
 

@@ -4,8 +4,8 @@ import numpy as np
 
 from realab_suite.lab.audit import aiming
 from realab_suite.lab.audit import attacks
+from realab_suite.lab.audit import macros
 from realab_suite.lab.audit import searches
-from realab_suite.policies import macros
 
 
 def _target(register, index=0, angles=(0.0, np.pi)):

@@ -7,7 +7,7 @@ from realab_suite import policies
 from realab_suite import suite
 from realab_suite.lab.audit import aiming
 from realab_suite.lab.audit import episodes
-from realab_suite.policies import macros
+from realab_suite.lab.audit import macros
 
 _KEY = np.zeros(2, np.uint64)
 _DESIGN = 'instantaneous_reward'
