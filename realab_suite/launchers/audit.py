@@ -65,7 +65,7 @@ def main() -> int:
       budget=_BUDGET.value,
       target=flags.TARGET.value,
   )
-  training.check_defence(settings.design)
+  training.check_learner(settings.design, flags.DESIGN.value, is_trained=False)
   with _progress() as on_progress:
     auditor = audits.Auditor(settings, on_progress)
     output, folder = flags.OUTPUT.value, None

@@ -70,11 +70,12 @@ def main() -> None:
       experiment.calibration_seeds if _CALIBRATION.value else experiment.seeds
   )
   planned = jobs.plan(experiment, seeds, only)
-  training.rehearse(
+  unfinished = [
       job
       for job in planned
       if not (folder / job.folder() / storage.DONE).exists()
-  )
+  ]
+  training.rehearse(unfinished, name)
   engine = engines.ENGINES[_ENGINE.value](_WORKERS.value or os.cpu_count() or 1)
   scheduler.sweep(
       experiment,

@@ -43,6 +43,7 @@ def main() -> None:
   from realab_suite.lab.experiments import training
 
   [job] = jobs.plan(experiment_specs.load(name), [flags.SEED.value], [run])
+  training.check_learners([job], name)
   options = training.Options(program.say, _PARENT.value)
   training.run(job, pathlib.Path(output), options)
 

@@ -39,10 +39,11 @@ class Climber(agents.Learner):
 
   OPTIONS = ClimberOptions
   READS = 'lures'
+  NEEDS_ACTION_SET = True
 
   def __init__(self, *arguments: Any) -> None:
     super().__init__(*arguments)
-    num_actions = self._controls.check_discrete(KIND)
+    num_actions = self._controls.size
     self.networks = {
         'sums': np.zeros(num_actions),
         'counts': np.ones(num_actions),

@@ -59,8 +59,13 @@ def test_the_exit_status_of_the_program_is_the_verdict(
         (['--target=score_2'], "'score_2'"),
         (['--senses=velocity'], 'needs the senses'),
         (
-            ['--set=learner.defence={kind: cap, hihg: 3}'],
-            "defence: unknown key 'hihg'; did you mean 'high'",
+            ['--set=learner.gama=0.9'],
+            "instantaneous_reward: learner: unknown key 'gama'; did you mean"
+            " 'gamma'?",
+        ),
+        (
+            ['--set=learner.kind=q_learning'],
+            'instantaneous_reward: action_set: missing',
         ),
     ],
 )

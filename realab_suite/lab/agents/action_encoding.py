@@ -77,21 +77,17 @@ class Controls:
       return self.num_actions
     return self.shape[0] - len(self.queries)
 
-  def check_discrete(self, kind: str) -> int:
-    """Returns the number of discrete actions.
-
-    Args:
-      kind: Name of the learner, for the message.
+  def check_discrete(self, kind: str) -> None:
+    """Checks that actions are indices, for a learner of some kind.
 
     Raises:
-      SpecError: If the actions are vectors.
+      SpecError: If they are vectors.
     """
     if self.num_actions is None:
       raise errors.SpecError(
           f'learner {kind!r}: actions are vectors of {self.size} elements;'
           ' the design must have an action_set'
       )
-    return self.num_actions
 
   def check_query(self, where: str, name: str) -> None:
     """Checks that a query register can hold the index of every action.

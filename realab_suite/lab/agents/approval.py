@@ -125,6 +125,8 @@ class DecoupledApprovalOptions(ApprovalOptions):
 class _ApprovalLearner(training.OnPolicyLearner, abc.ABC):
   """Base class of both approval learners, which differ in their options."""
 
+  NEEDS_ACTION_SET = True
+
   def __init__(self, *args: Any, **kwargs: Any) -> None:
     super().__init__(*args, **kwargs)
     for query in self._options.queries:
@@ -139,7 +141,7 @@ class _ApprovalLearner(training.OnPolicyLearner, abc.ABC):
     self._before: dict[str, Any] | None = None
 
   def _initial_networks(self, generator: np.random.Generator) -> Any:
-    num_actions = self._controls.check_discrete(self._options.kind)
+    num_actions = self._controls.size
     make = functools.partial(
         networks.Network, self._encoder, self._options.hidden
     )

@@ -174,6 +174,8 @@ class Learner(abc.ABC):
   READS: ClassVar[str]
   # Options that ask for wrappers, from the innermost on.
   WRAPPED: ClassVar[tuple[str, ...]] = ('frame_stack',)
+  # True if it chooses among the actions of a set.
+  NEEDS_ACTION_SET: ClassVar[bool] = False
   # True if it can learn from the actions of others; see `watch`. A wrapper that
   # acts sets it to False.
   is_off_policy = False
@@ -197,6 +199,8 @@ class Learner(abc.ABC):
     They are those of `Setting`, with `reading`, the key in the observation of
     the reading to learn from, and `seed`, that of all random draws.
     """
+    if self.NEEDS_ACTION_SET:
+      controls.check_discrete(options.kind)
     self._options = options
     self._reading = reading
     self._encoder = encoder

@@ -39,13 +39,12 @@ class BehaviouralCloning(training.OnPolicyLearner):
 
   OPTIONS = BehaviouralCloningOptions
   READS = 'demonstration'
+  NEEDS_ACTION_SET = True
   is_off_policy = True
 
   def _initial_networks(self, generator: np.random.Generator) -> Any:
-    num_actions = self._controls.check_discrete(self._options.kind)
-    policy = networks.Policy(
-        self._encoder, self._options.hidden, num_actions, True, generator
-    )
+    hidden, size = self._options.hidden, self._controls.size
+    policy = networks.Policy(self._encoder, hidden, size, True, generator)
     return policy, training.optimizer(self._options).init(policy)
 
   def _choose(

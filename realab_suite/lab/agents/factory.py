@@ -68,6 +68,31 @@ def make(
   return learner
 
 
+def check(design: specs.DesignSpec) -> None:
+  """Refuses the learner of a design, as far as no world is needed for it.
+
+  Raises:
+    SpecError: If the learner is unknown, an option is invalid, the design lacks
+      the action set that the learner needs, or its defence listens to anything
+      but a register that a provider writes.
+  """
+  options = options_of(design.learner)
+  learner_class = base.LEARNERS.get(options.kind)
+  if learner_class.NEEDS_ACTION_SET and design.action_set is None:
+    raise errors.SpecError(
+        f'action_set: missing, and learner {options.kind!r} chooses among the'
+        ' actions of a set; must be one, such as {name: dmlab_like, version: 1}'
+    )
+  written = {name for spec in design.providers for name in spec.writes}
+  defence = getattr(options, 'defence', None)
+  for name in defence.reads if defence else ():
+    if name not in written:
+      raise errors.SpecError(
+          f'learner.defence: listens to {name!r}, which is no register that a'
+          f' provider writes; must be one of {sorted(written)}'
+      )
+
+
 def options_of(
     spec: specs.LearnerSpec | Mapping[str, Any] | None,
 ) -> base.Options:

@@ -75,15 +75,15 @@ class QLearning(base.Learner):
   OPTIONS = QLearningOptions
   READS = 'reward'
   WRAPPED = ('frame_stack', 'gate')
+  NEEDS_ACTION_SET = True
   is_off_policy = True
 
   @jax_settings.pinned()
   def __init__(self, options: Any, *args: Any, **kwargs: Any) -> None:
     super().__init__(options, *args, **kwargs)
-    num_actions = self._controls.check_discrete(options.kind)
     generator = base.generator_of(self._keys['initial'])
     network = networks.Network(
-        self._encoder, options.hidden, num_actions, 0.01, generator
+        self._encoder, options.hidden, self._controls.size, 0.01, generator
     )
     optimizer_state = training.optimizer(options).init(network)
     self.networks = ((network, optimizer_state), network)

@@ -5,7 +5,7 @@ A checkpoint contains the full state; lines that were written after it are
 removed.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 import contextlib
 import dataclasses
 import os
@@ -121,7 +121,47 @@ def run(job: jobs.Job, output: pathlib.Path, options: Options) -> pathlib.Path:
   return path
 
 
-def rehearse(planned: Iterable[jobs.Job]) -> None:
+def check_learner(
+    design: specs.DesignSpec, where: str, *, is_trained: bool = True
+) -> None:
+  """Refuses the learner of a design before it is made; see `agents.check`.
+
+  Nothing is checked where the packages of learners are not installed.
+
+  Args:
+    design: The design.
+    where: Place of the design, for messages.
+    is_trained: False if only the objective of the learner is needed, so that it
+      may be one of another package, or missing.
+
+  Raises:
+    SpecError: If it cannot be made.
+  """
+  if requirements.missing('jax', 'equinox', 'optax', extra='agents'):
+    return
+  from realab_suite.lab import agents  # Imports JAX.
+
+  kind = design.learner and design.learner.kind
+  if is_trained or kind in agents.LEARNERS:
+    with _naming(where):
+      agents.check(design)
+
+
+def check_learners(planned: Iterable[jobs.Job], experiment: str) -> None:
+  """Refuses the learners of jobs before anything is run.
+
+  Args:
+    planned: The jobs.
+    experiment: Name or path of their experiment, for messages.
+
+  Raises:
+    SpecError: As `check_learner` does.
+  """
+  for place, job in _learners(planned, experiment).items():
+    check_learner(job.design, place)
+
+
+def rehearse(planned: Iterable[jobs.Job], experiment: str) -> None:
   """Makes the learner of each run once, before any job starts.
 
   So a trusted policy of other actions is refused at once, and not hours later,
@@ -129,64 +169,42 @@ def rehearse(planned: Iterable[jobs.Job]) -> None:
   installed; of runs that learn from data, only the options are.
 
   Args:
-    planned: Jobs to run.
+    planned: The jobs.
+    experiment: Name or path of their experiment, for messages.
 
   Raises:
-    SpecError: If a learner is unknown, an option is invalid, a defence listens
-      to anything but a register that a provider writes, or a learner does not
-      fit its worlds.
+    SpecError: As `check_learner` does, or if a learner does not fit its worlds.
   """
+  learners = _learners(planned, experiment)
+  check_learners(learners.values(), experiment)
   if requirements.missing('jax', 'equinox', 'optax', extra='agents'):
     return
-  for job in {job.run: job for job in planned if not job.policy}.values():
-    try:
-      _check_learner(job.design)
-      if job.data is None:
-        world = job.experiment.training_world
-        with contextlib.closing(
-            world.load_batch(job.design, job.training.num_envs, 0)
-        ) as batch:
-          make_learner(job, batch)
-    except errors.SpecError as error:
-      raise errors.SpecError(f'runs.{job.run}: {error}') from error
+  for place, job in learners.items():
+    if job.data is None:
+      with _naming(place), contextlib.closing(
+          job.experiment.training_world.load_batch(
+              job.design, job.training.num_envs, 0
+          )
+      ) as batch:
+        make_learner(job, batch)
 
 
-def check_defence(design: specs.DesignSpec) -> None:
-  """Checks the options of a learner that has a defence.
-
-  Nothing is checked of a learner of another package that is not imported, nor
-  where the packages of learners are not installed.
-
-  Raises:
-    SpecError: As `rehearse` does.
-  """
-  learner = design.learner
-  if learner is None or (learner.model_extra or {}).get('defence') is None:
-    return
-  if requirements.missing('jax', 'equinox', 'optax', extra='agents'):
-    return
-  from realab_suite.lab import agents  # Imports JAX.
-
-  if learner.kind in agents.LEARNERS:
-    _check_learner(design)
+def _learners(
+    planned: Iterable[jobs.Job], experiment: str
+) -> dict[str, jobs.Job]:
+  """Returns one job of each learner, by its place in an experiment."""
+  return {
+      f'{experiment}: runs.{job.run}': job for job in planned if not job.policy
+  }
 
 
-def _check_learner(design: specs.DesignSpec) -> None:
-  """Refuses invalid options, and a defence that hears nothing.
-
-  Raises:
-    SpecError: As `rehearse` does.
-  """
-  from realab_suite.lab import agents  # Imports JAX.
-
-  defence = getattr(agents.options_of(design.learner), 'defence', None)
-  written = {name for one in design.providers for name in one.writes}
-  for name in defence.reads if defence else ():
-    if name not in written:
-      raise errors.SpecError(
-          f'learner.defence: listens to {name!r}, which is no register that a'
-          f' provider writes; must be one of {sorted(written)}'
-      )
+@contextlib.contextmanager
+def _naming(place: str) -> Iterator[None]:
+  """Adds a place to errors about what is written there."""
+  try:
+    yield
+  except errors.SpecError as error:
+    raise errors.SpecError(f'{place}: {error}') from error
 
 
 def make_learner(
@@ -197,13 +215,13 @@ def make_learner(
 
   Raises:
     SpecError: If the kind of learner does not exist, it does not fit the
-      design, or packages of learners are not installed; or as `rehearse`.
+      design, or packages of learners are not installed.
   """
   if problem := requirements.missing('jax', 'equinox', 'optax', extra='agents'):
     raise errors.SpecError(f'learner {job.kind!r}: {problem}')
   from realab_suite.lab import agents  # Imports JAX.
 
-  _check_learner(job.design)
+  agents.check(job.design)
   return agents.make(
       job.design.learner,
       batch.observation_spec(),

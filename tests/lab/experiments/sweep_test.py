@@ -267,7 +267,11 @@ def test_an_interrupted_sweep_leaves_no_process_behind(tmp_path):
         ({'defence': {'kind': 'armour'}},
          "runs.own: learner has the defence 'armour'"),
         ({'defence': {'kind': 'cap', 'hgh': 3}},
-         "runs.own: learner: defence: unknown key 'hgh'"),
+         "one.yaml: runs.own: learner: defence: unknown key 'hgh'"),
+        ({'gama': 0.9},
+         "one.yaml: runs.own: learner: unknown key 'gama'; did you mean"
+         " 'gamma'?"),
+        ({'kind': 'q_learning'}, 'one.yaml: runs.own: action_set: missing'),
         # It is a register, but no provider writes it.
         ({'defence': {'kind': 'alarm', 'register': 'bell'}},
          "runs.own: learner.defence: listens to 'bell'"),
@@ -289,10 +293,11 @@ def test_a_wrong_learner_is_refused_before_anything_is_run(
                 'baselines': ['apple_seeker']}  # fmt: skip
   monkeypatch.chdir(tmp_path)
   (tmp_path / 'one.yaml').write_text(json.dumps(experiment))
-  complaint = in_process.complaint(
-      sweep, '--experiment=one.yaml', '--output=new'
-  )
-  assert message in complaint
+  command = ('--experiment=one.yaml', '--output=new')
+  assert message in in_process.complaint(sweep, *command)
+  if 'trusted' not in message:  # Only `sweep` makes the learner beforehand.
+    train_one = (*command, '--run=own', '--seed=0')
+    assert message in in_process.complaint(train, *train_one)
   assert not (tmp_path / 'new').exists()
 
 
