@@ -124,7 +124,7 @@ def _descend(
 def initial_spans(
     encoder: features.Encoder, num_more: int, num_envs: int, span: int
 ) -> dict[str, Any]:
-  """Returns the state of `join_spans` before the first batch.
+  """Returns the state of spans before the first batch.
 
   `num_more` is that of `networks.Network`, `span` the number of steps of a
   sample.
@@ -139,26 +139,40 @@ def initial_spans(
   return {'tail': tail, 'ages': np.zeros(num_envs, int)}
 
 
-def join_spans(
-    state: Mapping[str, Any], data: Mapping[str, Any], is_valid: np.ndarray
-) -> tuple[dict[str, np.ndarray], np.ndarray, dict[str, Any]]:
-  """Returns features from `span - 1` steps before a batch on, and its ages.
+def joined(
+    spans: Mapping[str, Any], data: Mapping[str, Any]
+) -> dict[str, np.ndarray]:
+  """Returns features from `span - 1` steps before a batch on.
 
   Args:
-    state: State that `initial_spans` or the last call returned.
+    spans: Result of `initial_spans`, or of `next_spans` for the last batch.
     data: Features of the batch, each `(time, worlds, ...)`.
+  """
+  return {
+      name: np.concatenate([before, np.asarray(data[name])])
+      for name, before in spans['tail'].items()
+  }
+
+
+def ages_of(spans: Mapping[str, Any], is_valid: np.ndarray) -> np.ndarray:
+  """Returns the number of each step of a batch in its episode, from 1.
+
+  Args:
+    spans: Same as in `joined`.
     is_valid: Same as in the batch, `(time, worlds)` bool.
 
   Returns:
-    The features; the number of each step of the batch in its episode, from 1,
-    `(time, worlds)` int, 0 where it is not valid; and the next state.
+    `(time, worlds)` int, 0 where a step is not valid.
   """
-  joined = {
-      name: np.concatenate([before, np.asarray(data[name])])
-      for name, before in state['tail'].items()
-  }
-  ages, age = np.zeros(is_valid.shape, int), state['ages']
+  ages, age = np.zeros(is_valid.shape, int), spans['ages']
   for t, is_outcome in enumerate(is_valid):
     ages[t] = age = np.where(is_outcome, age + 1, 0)
-  tail = {name: value[len(ages) :].copy() for name, value in joined.items()}
-  return joined, ages, {'tail': tail, 'ages': age}
+  return ages
+
+
+def next_spans(
+    features_of_spans: Mapping[str, np.ndarray], ages: np.ndarray
+) -> dict[str, Any]:
+  """Returns the state of spans after a batch, from `joined` and `ages_of`."""
+  tail = {n: x[len(ages) :].copy() for n, x in features_of_spans.items()}
+  return {'tail': tail, 'ages': ages[-1].copy()}

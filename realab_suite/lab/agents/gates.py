@@ -90,43 +90,17 @@ class Gatekeeper(base.Wrapper):
 
   def __init__(self, gate: Gate, learner: 'q_learning.QLearning') -> None:
     """Makes a wrapper, or raises a `SpecError` if the gate does not fit."""
+    _check_fit(gate, learner)
     self._gate, self._learner = gate, learner
     self._setting = setting = learner.setting
     learner.is_off_policy = False
-    options, num_envs = setting.options, setting.num_envs
-    if num_envs < 2:
-      raise errors.SpecError(
-          'learner.gate: in 1 world; must be in more, because a trial'
-          ' compares two halves of them'
-      )
-    self._trusted = None
-    if gate.trusted is not None:
-      self._trusted = gate.trusted.make(
-          setting.controls, num_envs, setting.encoder.names, 'learner.gate'
-      )
-    if gate.fit_steps <= options.min_replay:
-      raise errors.SpecError(
-          f'learner.gate.fit_steps: {gate.fit_steps}; must be more than'
-          f' min_replay, {options.min_replay}, before which nothing is fitted'
-      )
-    most = (learner.num_slots - options.num_returns) * num_envs
-    if gate.alarms > most:
-      raise errors.SpecError(
-          f'learner.gate.alarms: {gate.alarms}; must be at most {most},'
-          ' the transitions of the replay whose returns are known'
-      )
-    self._state: dict[str, Any] = {
-        # The model has the discount 0. `convinced` acts in every second world.
-        **dict.fromkeys(('model', 'values', 'convinced'), learner.networks),
-        'scale': 1.0,
-        'is_open': False,
-        'is_trying': False,
-        'num_tried': 0,
-        'scores': np.zeros(num_envs),
-        'is_judged': np.zeros(num_envs, bool),
-        'changed': 0.0,
-        'counts': dict.fromkeys(_COUNTED, 0),
-    }
+    self._trusted = gate.trusted and gate.trusted.make(
+        setting.controls,
+        setting.num_envs,
+        setting.encoder.names,
+        'learner.gate',
+    )
+    self._state = _initial_state(learner)
 
   def treat(self, batch: dict[str, Any]) -> dict[str, Any]:
     """Returns the transitions of a step without what is unexpected.
@@ -286,6 +260,44 @@ class Gatekeeper(base.Wrapper):
     self._state = base.from_plain(self._state, state['gate'])
     if self._trusted is not None:
       self._trusted.set_state(state['trusted'])
+
+
+def _check_fit(gate: Gate, learner: 'q_learning.QLearning') -> None:
+  """Refuses a gate that could never open, or never hold a trial."""
+  options, num_envs = learner.setting.options, learner.setting.num_envs
+  if num_envs < 2:
+    raise errors.SpecError(
+        'learner.gate: in 1 world; must be in more, because a trial'
+        ' compares two halves of them'
+    )
+  if gate.fit_steps <= options.min_replay:
+    raise errors.SpecError(
+        f'learner.gate.fit_steps: {gate.fit_steps}; must be more than'
+        f' min_replay, {options.min_replay}, before which nothing is fitted'
+    )
+  most = (learner.num_slots - options.num_returns) * num_envs
+  if gate.alarms > most:
+    raise errors.SpecError(
+        f'learner.gate.alarms: {gate.alarms}; must be at most {most},'
+        ' the transitions of the replay whose returns are known'
+    )
+
+
+def _initial_state(learner: 'q_learning.QLearning') -> dict[str, Any]:
+  """Returns the state of a gate before the first step."""
+  num_envs = learner.setting.num_envs
+  return {
+      # The model has the discount 0. `convinced` acts in every second world.
+      **dict.fromkeys(('model', 'values', 'convinced'), learner.networks),
+      'scale': 1.0,
+      'is_open': False,
+      'is_trying': False,
+      'num_tried': 0,
+      'scores': np.zeros(num_envs),
+      'is_judged': np.zeros(num_envs, bool),
+      'changed': 0.0,
+      'counts': dict.fromkeys(_COUNTED, 0),
+  }
 
 
 @functools.partial(jax.jit, static_argnums=0)

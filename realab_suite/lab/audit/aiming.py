@@ -242,18 +242,28 @@ def _aims(name: str) -> set[str]:
 def _first_target(
     name: str, env: environment.Environment, target: str | None
 ) -> Target:
-  """Returns the block that a policy moves; see `make_policy`."""
-  mechanism = env.mechanism
-  if target is None:
-    movable = attacked(mechanism.design)
-    feedback = mechanism.design.names('feedback')[:1]
-    first = [*map(mechanism.design.register_of, feedback)]
-    preferred = first if {*first} <= {*movable} else movable
-    target = next(iter([*preferred, *first]), '')
-  if target not in mechanism.registers:
+  """Returns the block that a policy moves; see `make_policy`.
+
+  Raises:
+    SpecError: If there is no such register.
+  """
+  design, known = env.mechanism.design, env.mechanism.registers
+  register = _default_target(design) if target is None else target
+  if register not in known:
     raise errors.SpecError(
-        f'policy {name!r} attacks a register, and design'
-        f' {mechanism.design.name!r} has no {target or "feedback register"!r};'
-        f' it has {sorted(mechanism.registers)}'
+        f'policy {name!r} attacks a register, and design {design.name!r} has'
+        f' no {register or "feedback register"!r}; it has {sorted(known)}'
     )
-  return targets(env, [target])[0]
+  return targets(env, [register])[0]
+
+
+def _default_target(design: specs.DesignSpec) -> str:
+  """Returns the register that saboteurs attack; '' without feedback registers.
+
+  It is the first feedback register, unless only others can be moved.
+  """
+  feedback, movable = design.names('feedback'), attacked(design)
+  if not feedback:
+    return ''
+  register = design.register_of(feedback[0])
+  return register if register in movable or not movable else movable[0]

@@ -17,6 +17,8 @@ from realab_suite import policies
 from realab_suite import worlds
 from realab_suite.engine import environment
 from realab_suite.evaluation import actors
+from realab_suite.evaluation import results
+from realab_suite.feedback import objectives
 from realab_suite.feedback import specs
 from realab_suite.lab.audit import aiming
 from realab_suite.lab.audit import attacks
@@ -33,6 +35,8 @@ from realab_suite.lab.verdicts import stakes
 # episodes, but too few to be sure.
 _WORLDS, _MORE_WORLDS = 20, 60
 _LEAST_HACKED = 2
+
+_Rows = list[results.EpisodeResult]
 
 OnProgress = Callable[[str, int, int], None]
 """Called with the phase, the episodes of the search so far, and the budget."""
@@ -84,33 +88,17 @@ class Auditor:
       SpecError: If the design has no stake, a name is unknown, or the agent
         lacks a sense that plans need.
     """
-    world, design = settings.world, settings.design
-    if design.objective is None or world.solver is None:
-      raise errors.SpecError(
-          f'design {design.name!r}: no audit, because there is no measure of'
-          f' gains: {judging.why_no_stakes(world, design)}'
-      )
     self._settings = settings
-    self._solver = world.solver
     self._on_progress = on_progress
-    movable = aiming.attacked(design)
-    names = aiming.attacked(design, settings.target)
-    if movable and not names:
-      raise errors.SpecError(
-          f'target: nothing can move register {settings.target!r}; must be'
-          f' one of {movable}'
-      )
-    with contextlib.closing(world.load(design, settings.seed_of(0))) as env:
-      env.reset()
-      self._targets = aiming.targets(env, names)
-      plan = macros.of_solver()
-      policy = episodes.policy_of(plan, env, self._targets, self._solver)
-      actors.make(policy, env)  # Checks its senses.
-    consumed = {*map(design.register_of, design.objective.registers)}
+    objective, self._solver = _measure_of_gains(settings)
+    names = _attacked(settings)
+    self._targets = _targets(settings, names, self._solver)
+    consumed = {*map(settings.design.register_of, objective.registers)}
     self._scripted = attacks.scripted(self._targets, consumed)
     least = searches.least_budget(self._scripted)
     self._budget = settings.budget or max(searches.DEFAULT_BUDGET, least)
-    self._is_sufficient = self._budget >= least and names == movable
+    attacks_all = names == aiming.attacked(settings.design)
+    self._is_sufficient = self._budget >= least and attacks_all
     self._num_searched = self._num_compared = 0
     self._num_failed = self._num_failed_in_search = 0
 
@@ -198,20 +186,12 @@ class Auditor:
   def _compare_in(
       self, num_worlds: int, plan: macros.Plan, stake: stakes.Stakes
   ) -> findings.Comparison:
-    settings = self._settings
+    """Compares a plan with the solver in this number of worlds."""
     self._num_compared += 1
     self._tell('comparison')
-    seed = settings.seed_of(self._num_compared)
-    with contextlib.closing(
-        settings.world.load_batch(settings.design, num_worlds, seed)
-    ) as batch:
-      player = episodes.Player(batch, self._targets, self._solver, seed)
-      solver = [one for one in player.play_solver() if one.counts]
-      batch.rewind()
-      watch = episodes.Watch(batch, self._targets)
-      batch.add_sink(watch)
-      played = player.play([plan] * num_worlds)
-    counting = [one for one in played if one.counts]
+    seed = self._settings.seed_of(self._num_compared)
+    solver, played, watch = self._play_both(num_worlds, plan, seed)
+    counting = [row for row in played if row.counts]
     self._num_failed += len(played) - len(counting)
     control = hacking.control(self._solver, solver, stake)
     if control is None or not counting:
@@ -223,6 +203,26 @@ class Auditor:
     return findings.Comparison(
         plan, seed, counting, solver, stake, watch, control, count
     )
+
+  def _play_both(
+      self, num_worlds: int, plan: macros.Plan, seed: int
+  ) -> tuple[_Rows, _Rows, episodes.Watch]:
+    """Plays the same episodes with the solver and with a plan.
+
+    Returns:
+      Episodes of the solver that count, those of the plan, and the movements of
+      blocks by the plan.
+    """
+    settings = self._settings
+    with contextlib.closing(
+        settings.world.load_batch(settings.design, num_worlds, seed)
+    ) as batch:
+      player = episodes.Player(batch, self._targets, self._solver, seed)
+      solver = [row for row in player.play_solver() if row.counts]
+      batch.rewind()
+      watch = episodes.Watch(batch, self._targets)
+      batch.add_sink(watch)
+      return solver, player.play([plan] * num_worlds), watch
 
   def _result(self, comparison: findings.Comparison) -> findings.Audit:
     obstacles = judging.obstacles_of(
@@ -249,3 +249,54 @@ class Auditor:
 
   def _tell(self, phase: str) -> None:
     self._on_progress(phase, self._num_searched, self._budget)
+
+
+def _measure_of_gains(
+    settings: Settings,
+) -> tuple[objectives.ObjectiveSpec, str]:
+  """Returns the objective of the learner, and the solver of the task.
+
+  Raises:
+    SpecError: If one of them is missing.
+  """
+  world, design = settings.world, settings.design
+  if design.objective is None or world.solver is None:
+    raise errors.SpecError(
+        f'design {design.name!r}: no audit, because there is no measure of'
+        f' gains: {judging.why_no_stakes(world, design)}'
+    )
+  return design.objective, world.solver
+
+
+def _attacked(settings: Settings) -> list[str]:
+  """Returns the names of the registers to attack.
+
+  Raises:
+    SpecError: If nothing can move the only one.
+  """
+  names = aiming.attacked(settings.design, settings.target)
+  movable = aiming.attacked(settings.design)
+  if movable and not names:
+    raise errors.SpecError(
+        f'target: nothing can move register {settings.target!r}; must be'
+        f' one of {movable}'
+    )
+  return names
+
+
+def _targets(
+    settings: Settings, names: list[str], solver: str
+) -> list[aiming.Target]:
+  """Returns the blocks of registers.
+
+  Raises:
+    SpecError: If the agent lacks a sense that plans need.
+  """
+  with contextlib.closing(
+      settings.world.load(settings.design, settings.seed_of(0))
+  ) as env:
+    env.reset()
+    targets = aiming.targets(env, names)
+    policy = episodes.policy_of(macros.of_solver(), env, targets, solver)
+    actors.make(policy, env)  # Checks its senses.
+  return targets

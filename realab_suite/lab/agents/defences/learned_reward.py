@@ -99,9 +99,8 @@ class LearnedReward(base.Defence):
       key: np.ndarray,
   ) -> base.Treated:
     data = base.data_of(batch, setting, with_readings=False)
-    spans, ages, joined = ensembles.join_spans(
-        state['spans'], data, batch['is_valid']
-    )
+    spans = ensembles.joined(state['spans'], data)
+    ages = ensembles.ages_of(state['spans'], batch['is_valid'])
     steps, num_known = state['counts'] + (ages.size, 0)
     is_kept = self.refit == 'never' and state['counts'][0] >= self.fit_steps
     is_end = (ages > 0) & (ages % self._span == 0) & (not is_kept)
@@ -141,7 +140,7 @@ class LearnedReward(base.Defence):
     reading = mean + deviation * ensembles.soft_least(values, self.beta)
     kept = {
         'ensemble': ensemble,
-        'spans': joined,
+        'spans': ensembles.next_spans(spans, ages),
         'counts': np.array([steps, num_known]),
         'moments': moments,
     }
