@@ -31,7 +31,6 @@ def point(
     Plain data. Means over valid episodes are `None` if there are no values.
   """
   valid = [episode for episode in episodes if episode['is_valid']]
-  names = list(valid[0]['own']) if valid else []
   return {
       'step': step,
       'num_episodes': len(episodes),
@@ -41,10 +40,6 @@ def point(
           for key in ('true_return', 'observed_return', 'corruption')
       },
       'gain': _mean(_gain(episode) for episode in valid),
-      'own': {
-          name: _mean(episode['own'][name] for episode in valid)
-          for name in names
-      },
       'learner': {
           name: float(value) if math.isfinite(value) else None
           for name, value in metrics.items()
@@ -76,7 +71,6 @@ def record(step: int, episode: results.EpisodeResult) -> dict[str, Any]:
           for name, value in episode.objective.items()
       },
       'is_ended_by_tampering': episode.is_ended_by_tampering,
-      'own': {name: one.own for name, one in episode.registers.items()},
   }
 
 

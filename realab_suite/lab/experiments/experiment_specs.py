@@ -225,8 +225,7 @@ class ExperimentSpec(validation.Spec):
   training: TrainingSpec = TrainingSpec()
   evaluation: EvaluationSpec = EvaluationSpec()
 
-  # Designs of the runs, with the specs that they were loaded for.
-  _designs: dict[str, tuple[RunSpec, specs.DesignSpec]] = pydantic.PrivateAttr(
+  _designs: dict[str, specs.DesignSpec] = pydantic.PrivateAttr(
       default_factory=dict
   )
 
@@ -278,7 +277,7 @@ class ExperimentSpec(validation.Spec):
             f'runs.{name}.twin: design {design.name!r} is {TWIN} already;'
             ' must be false'
         )
-      self._designs[name] = run, design
+      self._designs[name] = design
     for task in self.training.tasks:
       if registry.HELD_OUT in registry.tags(*task_names.split(task)):
         raise ValueError(
@@ -327,11 +326,7 @@ class ExperimentSpec(validation.Spec):
   @property
   def designs(self) -> Mapping[str, specs.DesignSpec]:
     """Designs of the runs with their changes, by the name of the run."""
-    for name, run in self.runs.items():
-      loaded_for, _ = self._designs.get(name, (None, None))
-      if loaded_for is not run:  # This is a copy with other runs.
-        self._designs[name] = run, run.load()
-    return {name: self._designs[name][1] for name in self.runs}
+    return self._designs
 
   @property
   def domain_and_variation(self) -> tuple[str, str]:

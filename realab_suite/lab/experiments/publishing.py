@@ -150,20 +150,12 @@ def load(folder: pathlib.Path) -> sweep_results.Sweep:
     ResultsError: If a file is missing or damaged. The message names it.
   """
   path = folder / sweep_results.CONTENTS
-  try:
-    published = _Published.model_validate(storage.read_json(path))
-  except pydantic.ValidationError as error:
-    first = error.errors()[0]
-    key_path = '.'.join(str(part) for part in first['loc'])
-    raise errors.ResultsError(f'{path}: {key_path}: {first["msg"]}') from error
+  published = sweep_results.validated(_Published, storage.read_json(path), path)
   rows = _by_job(folder / published_files.ROWS)
   points = _by_job(folder / published_files.CURVES)
   gains = _by_job(folder / published_files.GAINS)
-  planned: dict[str, list[sweep_results.Job]] = {}
-  for job in published.jobs:
-    planned.setdefault(job.run, []).append(job)
   runs = {}
-  for name, of_run in planned.items():
+  for name, of_run in sweep_results.by_run(published.jobs).items():
     finished = [job for job in of_run if job.folder in published.done]
     parts: dict[str, list[results.EpisodeResult]] = {
         part: [] for part in _PARTS
@@ -257,14 +249,11 @@ def _row(
       for name, value in leaves.items()
       if value is not None and name not in (_JOB, _PART)
   }
-  try:
-    return results.EpisodeResult.model_validate(published_files.nested(figures))
-  except pydantic.ValidationError as error:
-    first = error.errors()[0]
-    raise errors.ResultsError(
-        f'{folder / published_files.ROWS}: {".".join(map(str, first["loc"]))}:'
-        f' {first["msg"]}'
-    ) from error
+  return sweep_results.validated(
+      results.EpisodeResult,
+      published_files.nested(figures),
+      folder / published_files.ROWS,
+  )
 
 
 def _by_job(path: pathlib.Path) -> dict[str, list[dict[str, Any]]]:

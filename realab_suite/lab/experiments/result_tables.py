@@ -77,8 +77,6 @@ class Line:
     run: Name of the run.
     summary: Summary of the run.
     hacking: Hack rate and hack-free return, or `None` without a stake.
-    gained: True return minus that of the control; `None` for the control, and
-      without one.
     judgement: Verdict on the seeds of an agent, judgement on all episodes of a
       scripted policy, or `None` for the control.
     labels: Label of each seed of an agent; empty for scripted policies.
@@ -91,7 +89,6 @@ class Line:
   run: str
   summary: comparison.RunSummary
   hacking: hacking.Hacking | None
-  gained: intervals.Interval | None
   judgement: _Judged
   labels: _Labels
   means: Mapping[str, float | None]
@@ -139,16 +136,14 @@ def summarize(rows: Mapping[str, _Rows], rules: Rules) -> list[Line]:
     control = hacking.control(name, rows[name], stake, random)
   lines = []
   for run, of_run in rows.items():
-    summary, hacked, gained = comparison.summary(run, of_run), None, None
+    summary, hacked = comparison.summary(run, of_run), None
     judged: tuple[_Judged, _Labels] = None, {}
     if stake is not None and control is not None:
       hacked = hacking.hacking(of_run, control, stake)
     if run != name:
       judged = _judge(run, rows, hacked, rules)
-    if name is not None and run != name:
-      gained = comparison.gained(run, of_run, rows[name])
     means, outcomes = _means(of_run, rules.consumed), _outcomes(of_run)
-    lines.append(Line(run, summary, hacked, gained, *judged, means, outcomes))
+    lines.append(Line(run, summary, hacked, *judged, means, outcomes))
   return lines
 
 
@@ -292,7 +287,6 @@ def write_csv(lines: Sequence[Line], path: pathlib.Path) -> None:
           'run': line.run,
           **counts(line.summary),
           **ends(line.summary, line.hacking),
-          **tables.ends({'true_return_gained': line.gained}),
           'control_rate': line.hacking and line.hacking.control.count.rate,
           'limit': line.hacking and line.hacking.control.limit,
           'num_hacked': line.hacking and line.hacking.count.hacked,

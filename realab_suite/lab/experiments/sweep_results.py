@@ -9,7 +9,7 @@ import dataclasses
 import functools
 import json
 import pathlib
-from typing import Annotated, Any, Final, final
+from typing import Annotated, Any, Final, TypeVar, final
 
 import pydantic
 
@@ -25,6 +25,8 @@ from realab_suite.lab.experiments import scheduler
 from realab_suite.lab.experiments import storage
 from realab_suite.lab.experiments import training
 from realab_suite.lab.verdicts import stakes
+
+_Model = TypeVar('_Model', bound=pydantic.BaseModel)
 
 CONTENTS: Final = 'published.json'
 """File in the folder of published results; see `publishing`."""
@@ -237,6 +239,29 @@ class Sweep:
     return run.name
 
 
+def validated(model: type[_Model], content: Any, path: pathlib.Path) -> _Model:
+  """Returns the contents of a file as a model.
+
+  Raises:
+    ResultsError: If they do not fit. The message names the file and the first
+      problem.
+  """
+  try:
+    return model.model_validate(content)
+  except pydantic.ValidationError as error:
+    first = error.errors()[0]
+    key_path = '.'.join(map(str, first['loc'])) or 'contents'
+    raise errors.ResultsError(f'{path}: {key_path}: {first["msg"]}') from error
+
+
+def by_run(planned: Sequence[Job]) -> dict[str, list[Job]]:
+  """Returns jobs by the names of their runs, in planned order."""
+  jobs_of_runs: dict[str, list[Job]] = {}
+  for job in planned:
+    jobs_of_runs.setdefault(job.run, []).append(job)
+  return jobs_of_runs
+
+
 def is_sweep(folder: pathlib.Path) -> bool:
   """Returns True for the folder of a sweep, or of published results."""
   return any((folder / name).is_file() for name in (CONTENTS, scheduler.SWEEP))
@@ -262,17 +287,8 @@ def load(folder: pathlib.Path) -> Sweep:
         ' realab_suite.launchers.publish'
     )
   path = folder / scheduler.SWEEP
-  try:
-    description = _Description.model_validate(storage.read_json(path))
-  except pydantic.ValidationError as error:
-    first = error.errors()[0]
-    key_path = '.'.join(str(part) for part in first['loc'])
-    raise errors.ResultsError(
-        f'{path}: {key_path or "contents"}: {first["msg"]}'
-    ) from error
-  planned: dict[str, list[Job]] = {}
-  for job in description.jobs:
-    planned.setdefault(job.run, []).append(job)
+  description = validated(_Description, storage.read_json(path), path)
+  planned = by_run(description.jobs)
   unfinished = tuple(
       job
       for of_run in planned.values()

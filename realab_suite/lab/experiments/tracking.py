@@ -21,7 +21,7 @@ class RegisterTrack:
 
   The lists contain the last read of each step, and the last write before it.
   The first entry belongs to the reset. Without a read, the reading, the clean
-  content and the parts of the corruption are NaN.
+  content are NaN.
 
   Attributes:
     role: Role of the register.
@@ -29,9 +29,6 @@ class RegisterTrack:
     applied: Applied values.
     reading: Readings.
     clean: Clean contents.
-    obstruction: Obstructions, a part of the own corruption.
-    permanent: Permanent parts of the own corruption.
-    temporary: Temporary parts of the own corruption.
     blocks: Positions of the blocks at the end of each step, `(blocks, 2)` each,
       in metres.
   """
@@ -41,9 +38,6 @@ class RegisterTrack:
   applied: list[float] = dataclasses.field(default_factory=list)
   reading: list[float] = dataclasses.field(default_factory=list)
   clean: list[float] = dataclasses.field(default_factory=list)
-  obstruction: list[float] = dataclasses.field(default_factory=list)
-  permanent: list[float] = dataclasses.field(default_factory=list)
-  temporary: list[float] = dataclasses.field(default_factory=list)
   blocks: list[np.ndarray] = dataclasses.field(default_factory=list)
   _applied: float = math.nan
 
@@ -61,9 +55,8 @@ class RegisterTrack:
       else:
         read, applied = record, self._applied
     self.applied.append(applied if read is not None else self._applied)
-    for name in ('reading', 'clean', 'obstruction', 'permanent', 'temporary'):
-      series: list[float] = getattr(self, name)
-      series.append(math.nan if read is None else float(getattr(read, name)))
+    self.reading.append(math.nan if read is None else float(read.reading))
+    self.clean.append(math.nan if read is None else float(read.clean))
     self.blocks.append(blocks)
 
 

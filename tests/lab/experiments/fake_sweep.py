@@ -216,7 +216,6 @@ def _write_training(
     figures = {
         'step': step, 'true_return': true_return, 'corruption': corruption,
         'observed_return': next(iter(found.values())).observed,
-        'own': dict.fromkeys(job.design.registers, corruption),
     }  # fmt: skip
     curve.append(
         {**figures, 'num_episodes': 2, 'num_invalid': 0, 'learner': METRICS,
