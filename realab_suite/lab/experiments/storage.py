@@ -11,7 +11,7 @@ import fcntl
 import json
 import os
 import pathlib
-from typing import Any, final
+from typing import Any, Final, final
 
 from realab_suite import archive
 from realab_suite import errors
@@ -20,7 +20,10 @@ CONFIG = 'config.json'
 DONE = 'done.json'
 CHECKPOINT = 'checkpoint.ckpt'
 _LOCK = 'lock'
-_ADVICE = '; remove this file, then the same command begins the run again'
+RESTART: Final = (
+    '; remove this file, then the same command begins the run again'
+)
+"""Advice on a checkpoint that does not fit."""
 
 
 @contextlib.contextmanager
@@ -169,65 +172,18 @@ def naming(path: pathlib.Path, advice: str = '') -> Iterator[None]:
     raise errors.ResultsError(f'{path}: {error}{advice}') from error
 
 
-@final
-class RunFolder:
-  """Folder of one run, which only one process may use; see `locked`."""
+def begin(folder: pathlib.Path, config: Mapping[str, Any]) -> None:
+  """Writes the configuration of a run into its folder, unless there is one."""
+  if not (folder / CONFIG).exists():
+    write_json(folder / CONFIG, config)
 
-  def __init__(self, path: pathlib.Path, config: Mapping[str, Any]) -> None:
-    """Opens the folder.
 
-    Args:
-      path: Path of the folder.
-      config: Configuration to write into a new folder, as JSON.
-    """
-    self.path = path
-    if not (path / CONFIG).exists():
-      write_json(path / CONFIG, config)
-
-  @property
-  def is_done(self) -> bool:
-    """True if the run has finished."""
-    return (self.path / DONE).exists()
-
-  def finish(self, facts: Mapping[str, Any]) -> None:
-    """Marks the run as finished, records facts, and removes its checkpoint."""
-    write_json(self.path / DONE, facts)
-    with explained(self._checkpoint):
-      self._checkpoint.unlink(missing_ok=True)
-
-  @property
-  def _checkpoint(self) -> pathlib.Path:
-    return self.path / CHECKPOINT
-
-  def save(self, header: Mapping[str, Any], contents: Any) -> None:
-    """Writes a checkpoint, which replaces the last one.
-
-    Args:
-      header: Header that `load` compares.
-      contents: Tuples, lists and dicts of arrays, numbers, texts and `None`.
-
-    Raises:
-      ResultsError: If it cannot be written. The last one is kept.
-    """
-    write_archive(self._checkpoint, header, contents)
-
-  def load(self, header: Mapping[str, Any]) -> Any:
-    """Returns the contents of the checkpoint, or `None` without one.
-
-    Raises:
-      ResultsError: If it is damaged or belongs to another run.
-    """
-    if not self._checkpoint.exists():
-      return None
-    return read_archive(self._checkpoint, header, _ADVICE)
-
-  def naming_checkpoint(self) -> contextlib.AbstractContextManager[None]:
-    """Returns a context in which a checkpoint is restored.
-
-    An error about a state that does not fit then names the checkpoint, and says
-    to remove it.
-    """
-    return naming(self._checkpoint, _ADVICE)
+def finish(folder: pathlib.Path, facts: Mapping[str, Any]) -> None:
+  """Marks a run as finished, records facts, and removes its checkpoint."""
+  write_json(folder / DONE, facts)
+  checkpoint = folder / CHECKPOINT
+  with explained(checkpoint):
+    checkpoint.unlink(missing_ok=True)
 
 
 @final

@@ -96,9 +96,9 @@ def run(job: jobs.Job, output: pathlib.Path, options: Options) -> pathlib.Path:
   options.check_parent()
   path = output / job.folder()
   with storage.locked(path):
-    folder = storage.RunFolder(path, job.config())
+    storage.begin(path, job.config())
     jobs.read_config(path)  # Refuses another configuration.
-    if folder.is_done:
+    if (path / storage.DONE).exists():
       options.say(f'{path} has finished already')
       return path
     learner = None
@@ -106,7 +106,7 @@ def run(job: jobs.Job, output: pathlib.Path, options: Options) -> pathlib.Path:
         'machines': [{'step': 0, 'machine': machines.here()}]
     }
     if job.policy is None:
-      learner, facts = _Training(job, folder, options).run()
+      learner, facts = _Training(job, path, options).run()
       state = learner.state()
       storage.write_archive(
           path / LEARNER, header(job.digest(), LEARNER), state
@@ -116,7 +116,7 @@ def run(job: jobs.Job, output: pathlib.Path, options: Options) -> pathlib.Path:
     if job.embedded is not None:
       rows = _evaluate(job.transplant, learner, None, output)
       storage.write_whole(path / TRANSPLANT, rows)
-    folder.finish(facts)
+    storage.finish(path, facts)
   options.say(f'Results are in {path}')
   return path
 
@@ -324,11 +324,12 @@ class _Training:
   def __init__(
       self,
       job: jobs.Job,
-      folder: storage.RunFolder,
+      path: pathlib.Path,
       options: Options,
   ) -> None:
     self._job = job
-    self._folder = folder
+    self._path = path
+    self._checkpoint = path / storage.CHECKPOINT
     self._options = options
     training = job.training
     self._sleep = training.sleep
@@ -361,8 +362,12 @@ class _Training:
     Returns:
       The learner, and facts about its training.
     """
-    job, path = self._job, self._folder.path
-    saved = self._folder.load(header(job.digest(), _CHECKPOINT))
+    job, path = self._job, self._path
+    saved = None
+    if self._checkpoint.exists():
+      saved = storage.read_archive(
+          self._checkpoint, header(job.digest(), _CHECKPOINT), storage.RESTART
+      )
     sizes = (saved or {}).get('sizes', {})
     if saved is not None:
       self._done, self._segment = saved['done'], saved['segment']
@@ -381,7 +386,7 @@ class _Training:
             else self._recorded.at(0)[0]
         )
       else:
-        with self._folder.naming_checkpoint():
+        with storage.naming(self._checkpoint, storage.RESTART):
           time_step = self._restore(learner, saved)
       for name in (*self._cut, TIMING):
         size = None if name == TIMING else sizes.get(name, 0)
@@ -482,7 +487,7 @@ class _Training:
         (jobs.UNADAPTED, job.experiment.task),
     ):
       rows = _evaluate(
-          job.at_stage(stage, task), learner, None, self._folder.path.parent
+          job.at_stage(stage, task), learner, None, self._path.parent
       )
       self._files[STAGES].write(rows)
 
@@ -518,7 +523,8 @@ class _Training:
       time_step = _truncated(time_step)
     elif self._recorded is None:
       world = np.frombuffer(self._batch.save().to_bytes(), np.uint8)
-    self._folder.save(
+    storage.write_archive(
+        self._checkpoint,
         header(self._job.digest(), _CHECKPOINT),
         {
             'done': self._done,

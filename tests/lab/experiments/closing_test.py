@@ -128,7 +128,7 @@ _PLACES: list[tuple[Any, str, int]] = [
     (training, 'make_learner', 0),
     (_BATCH, 'step', 9),
     (_BATCH, 'save', 0),
-    (storage.RunFolder, 'finish', 0),
+    (storage, 'finish', 0),
 ]
 
 

@@ -74,12 +74,10 @@ def _kinds(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Kind]:
   ]
   run = sweep / job['folder']
   header = {'configuration': '0123456789ab', 'what': 'checkpoint'}
-  (folder / 'run').mkdir()
-  checkpoints = storage.RunFolder(folder / 'run', {'seed': 0})
   state = {'weights': np.arange(20.0), 'done': 7, 'nothing': None,
            'names': ['a', 'b'], 'pair': (1, 2.5)}  # fmt: skip
-  checkpoints.save(header, state)
-  checkpoint = folder / 'run' / storage.CHECKPOINT
+  checkpoint = folder / storage.CHECKPOINT
+  storage.write_archive(checkpoint, header, state)
   with suite.load('collect_apples', 'standard', {'random': 0}) as env:
     env.reset()
     world, world_header = env.save().to_bytes(), env.snapshot_header()
@@ -102,7 +100,9 @@ def _kinds(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Kind]:
     return sweep_results.load(sweep).runs['reward'].traces
 
   return {
-      'checkpoint': Kind(checkpoint, lambda: checkpoints.load(header)),
+      'checkpoint': Kind(
+          checkpoint, lambda: storage.read_archive(checkpoint, header)
+      ),
       'snapshot': Kind(snapshot, load_snapshot),
       'network': Kind(network, lambda: network_files.load(network).digest()),
       'trace.bin': Kind(run / training.TRACE, load_trace),

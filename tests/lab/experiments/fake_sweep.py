@@ -77,14 +77,15 @@ def build(
   scheduler._describe(one, planned, calibration, folder)
   for i, job in enumerate(planned):
     rng = np.random.default_rng((i, job.seed))
-    with storage.locked(folder / job.folder()):
-      run = storage.RunFolder(folder / job.folder(), job.config())
+    path = folder / job.folder()
+    with storage.locked(path):
+      storage.begin(path, job.config())
       if (job.run, job.seed) in left_out:
         line = json.dumps({'step': 4000, 'true_return': 1.0})
-        (run.path / training.CURVE).write_text(f'{line}\n{{"step": 60')
+        (path / training.CURVE).write_text(f'{line}\n{{"step": 60')
         continue
-      _write(run.path, job, rng)
-      run.finish({})
+      _write(path, job, rng)
+      storage.finish(path, {})
   return folder
 
 

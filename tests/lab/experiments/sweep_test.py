@@ -69,7 +69,8 @@ class Pretender(engines.Engine):
       [job] = jobs.plan(experiment, [seed], [_flag(task, 'run')])
       folder = pathlib.Path(_flag(task, 'output')) / job.folder()
       with storage.locked(folder):
-        storage.RunFolder(folder, job.config()).finish({})
+        storage.begin(folder, job.config())
+        storage.finish(folder, {})
     return status
 
   def stop(self, tasks):
@@ -153,7 +154,8 @@ def test_a_job_whose_process_survived_its_sweep_is_done_once(
     num_pauses += 1
     if num_pauses == 5:
       with survivors:
-        storage.RunFolder(tmp_path / job.folder(), job.config()).finish({})
+        storage.begin(tmp_path / job.folder(), job.config())
+        storage.finish(tmp_path / job.folder(), {})
 
   monkeypatch.setattr(scheduler.time, 'sleep', sleep)
   said = _sweep(_SMALL, tmp_path, engine)
