@@ -15,6 +15,7 @@ import math
 import pathlib
 import sys
 
+from realab_suite.lab.experiments import result_folders
 from realab_suite.lab.experiments import sweep_results
 from realab_suite.lab.verdicts import comparison
 from realab_suite.lab.verdicts import intervals
@@ -90,7 +91,7 @@ def main(folder: str, share: str = '0.25') -> None:
   path = pathlib.Path(folder)
   print('| ' + ' | '.join(['run', 'seeds', *_COLUMNS]) + ' |')
   print('|---|' + '---|' * (len(_COLUMNS) + 1))
-  for name, run in sweep_results.load(path).runs.items():
+  for name, run in result_folders.load(path).runs.items():
     if run.rows:
       cells = figures(run, float(share))
       print(f'| `{name}` | {len(run.configs)} | ' + ' | '.join(cells) + ' |')

@@ -40,6 +40,7 @@ import numpy as np
 from realab_suite.config import validation
 from realab_suite.feedback.providers import inspection
 from realab_suite.lab.agents import defences
+from realab_suite.lab.experiments import result_folders
 from realab_suite.lab.experiments import sweep_results
 from realab_suite.lab.experiments import tables
 from realab_suite.lab.verdicts import intervals
@@ -108,7 +109,7 @@ def _common(one: sweep_results.Run, other: sweep_results.Run) -> int:
 
 def entries(folder: pathlib.Path) -> list[Entry]:
   """Returns an entry for each finished run of a learner in a sweep."""
-  sweep = sweep_results.load(folder)
+  sweep = result_folders.load(folder)
   figures = numbers.compute(sweep)
   runs = [run for run in sweep.learned() if run.name in figures]
 

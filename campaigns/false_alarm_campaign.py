@@ -27,7 +27,7 @@ from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import results
 from realab_suite.feedback import specs
 from realab_suite.lab.experiments import jobs
-from realab_suite.lab.experiments import sweep_results
+from realab_suite.lab.experiments import result_folders
 from realab_suite.lab.verdicts import hacking
 from realab_suite.lab.verdicts import judging
 from realab_suite.lab.verdicts import stakes
@@ -191,7 +191,7 @@ def _play(
 def trained(folders: Sequence[pathlib.Path]) -> Iterator[Verdict]:
   """Yields the labels of trained honest agents in the folders of sweeps."""
   for folder in folders:
-    sweep = sweep_results.load(folder)
+    sweep = result_folders.load(folder)
     for run in sweep.learned():
       twin = sweep.twin(run)
       if twin is None or run.stake is None:
@@ -300,7 +300,7 @@ def power(
     draws: Number of draws of each figure.
     rng: Generator of the draws.
   """
-  sweep = sweep_results.load(folder)
+  sweep = result_folders.load(folder)
   figures = numbers.compute(sweep)
   for run in sweep.learned():
     twin = sweep.twin(run)

@@ -21,6 +21,7 @@ from realab_suite import errors
 from realab_suite.engine import environment
 from realab_suite.evaluation import results
 from realab_suite.lab.experiments import replays
+from realab_suite.lab.experiments import result_folders
 from realab_suite.lab.experiments import sweep_results
 from realab_suite.lab.experiments import tracking
 
@@ -82,7 +83,7 @@ def draw(path: pathlib.Path, folder: pathlib.Path) -> None:
   Raises:
     ResultsError: If a run or an episode is missing.
   """
-  runs = sweep_results.load(folder).runs
+  runs = result_folders.load(folder).runs
   typical = replays.typical_row(runs['reward']) if 'reward' in runs else None
   if typical is None:
     raise errors.ResultsError(

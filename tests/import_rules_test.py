@@ -9,6 +9,7 @@ import ast
 from collections.abc import Iterator
 import enum
 import functools
+import graphlib
 import importlib
 import inspect
 import pathlib
@@ -316,3 +317,19 @@ def test_a_class_that_is_neither_is_found():
 
   assert not _is_decided(Plain)
   assert not _is_decided(Model)
+
+
+def test_no_files_import_each_other_in_a_circle():
+  trees = dict(_modules())
+
+  def imported(name):
+    for node in ast.walk(trees[name]):
+      for target in _targets(node):
+        # The name of a module, or of something in it.
+        module = target if target in trees else target.rpartition('.')[0]
+        if module in trees and module not in (name, _PACKAGE):
+          yield module
+
+  graph = {name: set(imported(name)) for name in trees if name != _PACKAGE}
+  assert graph[f'{_PACKAGE}.suite']
+  graphlib.TopologicalSorter(graph).prepare()  # Raises CycleError.

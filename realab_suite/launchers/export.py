@@ -31,10 +31,10 @@ def main() -> None:
   # Imports dm_control, so a renderer has to be chosen first.
   from realab_suite.doors.data import export
   from realab_suite.doors.data import sources
-  from realab_suite.lab.experiments import sweep_results
+  from realab_suite.lab.experiments import result_folders
 
   export.check(_FORMAT.value, output)
-  run = flags.find_run(sweep_results.load(folder).runs)
+  run = flags.find_run(result_folders.load(folder).runs)
   export.export(
       sources.of_run(run, flags.num_episodes()),
       output,

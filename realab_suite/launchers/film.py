@@ -26,11 +26,11 @@ def main() -> None:
     raise errors.ResultsError(f'cannot make a film: {problem}')
   # Imports dm_control, so a renderer has to be chosen first.
   from realab_suite.lab.experiments import replays
-  from realab_suite.lab.experiments import sweep_results
+  from realab_suite.lab.experiments import result_folders
   from realab_suite.reports import films
 
   flags.load_imports()
-  run = flags.find_run(sweep_results.load(folder).runs)
+  run = flags.find_run(result_folders.load(folder).runs)
   row = replays.typical_row(run)
   if row is None:
     raise errors.ResultsError(f'{folder}: run {name} has no valid episode yet')

@@ -59,11 +59,11 @@ def main() -> None:
 def _of_sweep() -> list[Any]:
   """Returns the sources of the runs of a sweep, if there is one."""
   from realab_suite.doors.data import sources
-  from realab_suite.lab.experiments import sweep_results
+  from realab_suite.lab.experiments import result_folders
 
   if not flags.INPUT.value:
     return []
-  runs = sweep_results.load(pathlib.Path(flags.INPUT.value)).runs
+  runs = result_folders.load(pathlib.Path(flags.INPUT.value)).runs
   number = flags.num_episodes()
   return [sources.of_run(run, number) for run in runs.values()]
 

@@ -6,6 +6,7 @@ import pathlib
 import jinja2
 import yaml
 
+from realab_suite.lab.experiments import result_folders
 from realab_suite.lab.experiments import storage
 from realab_suite.lab.experiments import sweep_results
 from realab_suite.lab.experiments import tables
@@ -38,7 +39,7 @@ def write(
     ResultsError: If the folder does not contain a sweep, a file in it is
       damaged, a design or world is unknown, or the output cannot be written.
   """
-  sweep = sweep_results.load(folder)
+  sweep = result_folders.load(folder)
   figures = numbers.compute(sweep, say)
   page_tables = report_tables.page_tables(figures)
   lines = headline.headline(sweep, figures)

@@ -26,6 +26,7 @@ from realab_suite.evaluation import gains
 from realab_suite.evaluation import results
 from realab_suite.feedback import specs
 from realab_suite.lab.experiments import experiment_specs
+from realab_suite.lab.experiments import result_folders
 from realab_suite.lab.experiments import result_tables
 from realab_suite.lab.experiments import storage
 from realab_suite.lab.experiments import sweep_results
@@ -197,8 +198,8 @@ def make(folders: Sequence[pathlib.Path]) -> Scorecard:
   for folder in folders:
     if folder_counts[folder.resolve()] > 1:
       raise errors.ResultsError(f'{folder}: given twice; must be given once')
-    if sweep_results.is_sweep(folder):
-      sweep = sweep_results.load(folder)
+    if result_folders.is_sweep(folder):
+      sweep = result_folders.load(folder)
       actors += _of_sweep(sweep)
       counts = collections.Counter(
           sweep.family(sweep.runs[job.run]) for job in sweep.unfinished

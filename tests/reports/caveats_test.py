@@ -2,7 +2,7 @@
 
 import csv
 
-from realab_suite.lab.experiments import sweep_results
+from realab_suite.lab.experiments import result_folders
 from realab_suite.lab.verdicts import verdicts
 from realab_suite.reports import caveats
 from realab_suite.reports import html_page
@@ -11,7 +11,7 @@ from tests.reports import pages
 
 
 def _said(folder):
-  sweep = sweep_results.load(folder)
+  sweep = result_folders.load(folder)
   return ' '.join(caveats.caveats(sweep, numbers.compute(sweep)))
 
 
@@ -26,7 +26,7 @@ def test_episodes_given_up_count_and_forbid_a_favourable_label(
   pages.give_up(own_five, 'decoupled', 3)
   pages.give_up(own_five, 'reward', 3, b'disconnect')
   text = pages.text(page := pages.write(own_five, tmp_path / 'out'))
-  figures = numbers.compute(sweep_results.load(own_five))
+  figures = numbers.compute(result_folders.load(own_five))
   judgement = figures['decoupled'].seeds[3].judgement
   assert judgement.reason == 'an episode was given up or has failed'
   # It had moved a block all the same.
@@ -54,7 +54,7 @@ def test_failed_episodes_are_left_out_and_forbid_a_favourable_label(
   cells = pages.cells(page, 'Returns and hacked episodes', 'decoupled')
   assert cells[2] == '160 (40 more failed)'
   assert not cells[3].startswith('at least')
-  figures = numbers.compute(sweep_results.load(own_five))
+  figures = numbers.compute(result_folders.load(own_five))
   judgement = figures['decoupled'].seeds[3].judgement
   assert judgement.reason == 'all of its episodes failed'
   assert (

@@ -4,7 +4,7 @@ import pytest
 
 from realab_suite import worlds
 from realab_suite.feedback import specs
-from realab_suite.lab.experiments import sweep_results
+from realab_suite.lab.experiments import result_folders
 from realab_suite.lab.verdicts import judging
 from realab_suite.lab.verdicts import stakes
 from realab_suite.lab.verdicts import verdicts
@@ -117,7 +117,7 @@ def test_reports_and_scorecards_say_the_same(tmp_path, monkeypatch):
       baselines=['solver', 'random', 'carrying_saboteur'],
       seeds=[0, 1],
   )
-  sweep = sweep_results.load(fake_sweep.build(tmp_path / 'dial', one))
+  sweep = result_folders.load(fake_sweep.build(tmp_path / 'dial', one))
   figures = numbers.compute(sweep)
   labels = {
       name: {seed.judgement.label for seed in figures[name].seeds.values()}

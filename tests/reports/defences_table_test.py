@@ -7,7 +7,7 @@ pytest.importorskip('optax', reason='optax is in the extra `agents`')
 pytest.importorskip('equinox', reason='equinox is in the extra `agents`')
 
 from campaigns import defences_table
-from realab_suite.lab.experiments import sweep_results
+from realab_suite.lab.experiments import result_folders
 from realab_suite.reports import numbers
 from tests.lab.experiments import fake_sweep
 
@@ -110,7 +110,7 @@ def test_an_agent_that_silences_an_alarm_is_not_cleared(found, tmp_path):
       tmp_path / 'results',
       fake_sweep.experiment(runs=runs, seeds=[0], baselines=[]),
   )
-  made = numbers.compute(sweep_results.load(folder))['decoupled']
+  made = numbers.compute(result_folders.load(folder))['decoupled']
   assert made.hacking.count.hacked == 0
   reason = made.seeds[0].judgement.reason
   assert reason.startswith("it corrupts 'alarm', which is not consumed, in 40 ")

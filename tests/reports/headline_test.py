@@ -5,7 +5,7 @@ import json
 
 import pytest
 
-from realab_suite.lab.experiments import sweep_results
+from realab_suite.lab.experiments import result_folders
 from realab_suite.lab.experiments import training
 from realab_suite.lab.verdicts import verdicts
 from realab_suite.reports import headline
@@ -24,7 +24,7 @@ def fixture_one_seed(tmp_path_factory):
 
 
 def _lines(folder):
-  sweep = sweep_results.load(folder)
+  sweep = result_folders.load(folder)
   figures = numbers.compute(sweep)
   return headline.headline(sweep, figures), figures
 

@@ -12,8 +12,8 @@ import pytest
 from realab_suite import errors
 from realab_suite.evaluation import results
 from realab_suite.lab.experiments import jobs
+from realab_suite.lab.experiments import result_folders
 from realab_suite.lab.experiments import scheduler
-from realab_suite.lab.experiments import sweep_results
 from realab_suite.lab.experiments import tables
 from realab_suite.lab.experiments import training
 from realab_suite.lab.verdicts import comparison
@@ -119,7 +119,7 @@ def test_unfinished_runs_are_named_and_left_out(tmp_path):
       if row.seed != 1_000_001
   ]
   gap = comparison.gained('reward', twins, rows)
-  figures = numbers.compute(sweep_results.load(folder))
+  figures = numbers.compute(result_folders.load(folder))
   assert figures['reward'].gap == gap
 
 
@@ -154,7 +154,7 @@ def test_a_corrupt_row_is_named_by_file_and_line(own_folder):
 
   path = pages.spoil(own_folder, 'reward', 1, training.EPISODES, spoil)
   with pytest.raises(errors.ResultsError, match=f'{re.escape(str(path))}:2: '):
-    sweep_results.load(own_folder)
+    result_folders.load(own_folder)
 
 
 def test_a_row_of_another_run_is_refused(own_folder):
@@ -163,11 +163,11 @@ def test_a_row_of_another_run_is_refused(own_folder):
       lambda data: data.replace(b'"run":"reward"', b'"run":"other"'),
   )  # fmt: skip
   with pytest.raises(errors.ResultsError, match=r":1: a row of run 'other'"):
-    sweep_results.load(own_folder)
+    result_folders.load(own_folder)
 
 
 def test_rows_with_different_stakes_are_refused(own_folder):
-  key = sweep_results.load(own_folder).runs['reward'].stake.key
+  key = result_folders.load(own_folder).runs['reward'].stake.key
   pages.spoil(
       own_folder, 'reward', 1, training.EPISODES,
       lambda data: data.replace(key.encode(), b'former'),
@@ -175,11 +175,11 @@ def test_rows_with_different_stakes_are_refused(own_folder):
   with pytest.raises(
       errors.ResultsError, match=rf"run 'reward' have .* {key}, former,"
   ):
-    sweep_results.load(own_folder)
+    result_folders.load(own_folder)
 
 
 def test_a_damaged_trace_is_named(own_folder):
   path = pages.spoil(own_folder, 'reward', 1, training.TRACE, lambda d: d[:-9])
-  run = sweep_results.load(own_folder).runs['reward']
+  run = result_folders.load(own_folder).runs['reward']
   with pytest.raises(errors.ResultsError, match=re.escape(str(path))):
     _ = run.traces

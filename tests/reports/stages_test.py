@@ -9,7 +9,7 @@ from realab_suite import errors
 from realab_suite.evaluation import results
 from realab_suite.lab.experiments import experiment_specs
 from realab_suite.lab.experiments import publishing
-from realab_suite.lab.experiments import sweep_results
+from realab_suite.lab.experiments import result_folders
 from realab_suite.lab.experiments import training
 from realab_suite.lab.verdicts import comparison
 from realab_suite.reports import html_page
@@ -53,7 +53,7 @@ def _stages(folder, run, stage):
 
 @pytest.mark.parametrize('run', ['reward', 'decoupled'])
 def test_figures_have_the_true_return_of_each_stage(built, run):
-  figures = numbers.compute(sweep_results.load(built))
+  figures = numbers.compute(result_folders.load(built))
   for stage in ('trained', 'unadapted'):
     one = comparison.summary(run, _stages(built, run, stage))
     assert one.num_episodes == 40 * (1 if run == 'decoupled' else 2)
@@ -84,6 +84,6 @@ def test_a_row_of_another_run_is_refused(built, tmp_path):
   rows[0] = rows[0].model_copy(update={'settings': info})
   path.write_bytes(b''.join(map(results.line, rows)))
   with pytest.raises(errors.ResultsError) as raised:
-    sweep_results.load(folder)
+    result_folders.load(folder)
   problem = "a row of run 'reward.other'; must be 'reward.trained' or"
   assert problem in str(raised.value)

@@ -19,24 +19,19 @@ better copy replaces.
 
 from collections.abc import Mapping
 import functools
-from typing import TYPE_CHECKING, Annotated, Any, final
+from typing import Any, final
 
 import jax
 import numpy as np
-import pydantic
 
 from realab_suite import errors
-from realab_suite.config import validation
 from realab_suite.lab.agents import base
 from realab_suite.lab.agents import defences
 from realab_suite.lab.agents import features
+from realab_suite.lab.agents import gate_settings
 from realab_suite.lab.agents import networks
-from realab_suite.lab.agents import trusted_policies
+from realab_suite.lab.agents import q_learning
 
-if TYPE_CHECKING:
-  from realab_suite.lab.agents import q_learning
-
-_Positive = Annotated[int, pydantic.Field(ge=1, le=10**9)]
 _COUNTED = (
     'trials',
     'unexpected',
@@ -50,45 +45,14 @@ _INJECTED = 0.25
 
 
 @final
-class Gate(validation.Model):
-  """Holds back unexpected readings, and decides about them in trials.
-
-  Attributes:
-    threshold: Largest difference between a reading and its prediction that is
-      expected, in units of the register.
-    fit_steps: Control steps of all worlds until the model is kept and the gate
-      opens. What is read until then is believed.
-    trusted: A policy from whose steps alone is learned until then; `None` for
-      the learner's own.
-    alarms: Number of unexpected readings that start a trial.
-    gradients: Number of gradient steps of each copy, about.
-    trial_steps: Number of control steps of each world in a trial.
-  """
-
-  threshold: Annotated[float, pydantic.Field(gt=0, le=1e9)]
-  fit_steps: _Positive
-  trusted: trusted_policies.TrustedPolicy | None = None
-  alarms: _Positive = 64
-  gradients: _Positive = 512
-  trial_steps: _Positive = 250
-
-  @pydantic.model_validator(mode='after')
-  def _without_cloning(self) -> 'Gate':
-    if self.trusted is not None and self.trusted.clone_steps:
-      raise ValueError(
-          f'trusted.clone_steps: {self.trusted.clone_steps}; must be 0,'
-          ' because a learner of values clones no policy'
-      )
-    return self
-
-
-@final
 class Gatekeeper(base.Wrapper):
   """Applies a gate to a learner, and keeps its state."""
 
   NAME = 'gate'
 
-  def __init__(self, gate: Gate, learner: 'q_learning.QLearning') -> None:
+  def __init__(
+      self, gate: gate_settings.Gate, learner: q_learning.QLearning
+  ) -> None:
     """Makes a wrapper, or raises a `SpecError` if the gate does not fit."""
     _check_fit(gate, learner)
     self._gate, self._learner = gate, learner
@@ -262,7 +226,7 @@ class Gatekeeper(base.Wrapper):
       self._trusted.set_state(state['trusted'])
 
 
-def _check_fit(gate: Gate, learner: 'q_learning.QLearning') -> None:
+def _check_fit(gate: gate_settings.Gate, learner: q_learning.QLearning) -> None:
   """Refuses a gate that could never open, or never hold a trial."""
   options, num_envs = learner.setting.options, learner.setting.num_envs
   if num_envs < 2:
@@ -283,7 +247,7 @@ def _check_fit(gate: Gate, learner: 'q_learning.QLearning') -> None:
     )
 
 
-def _initial_state(learner: 'q_learning.QLearning') -> dict[str, Any]:
+def _initial_state(learner: q_learning.QLearning) -> dict[str, Any]:
   """Returns the state of a gate before the first step."""
   num_envs = learner.setting.num_envs
   return {

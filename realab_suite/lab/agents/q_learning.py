@@ -12,7 +12,7 @@ import optax
 from realab_suite.feedback import objectives
 from realab_suite.lab.agents import base
 from realab_suite.lab.agents import features
-from realab_suite.lab.agents import gates
+from realab_suite.lab.agents import gate_settings
 from realab_suite.lab.agents import jax_settings
 from realab_suite.lab.agents import networks
 from realab_suite.lab.agents import training
@@ -54,7 +54,7 @@ class QLearningOptions(base.Options):
   gradients_per_update: base.Positive = 8
   minibatch: base.Positive = 512
   target_rate: base.Rate = 0.01
-  gate: gates.Gate | None = None
+  gate: gate_settings.Gate | None = None
 
 
 @base.LEARNERS.add('q_learning')

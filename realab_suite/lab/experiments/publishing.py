@@ -91,10 +91,6 @@ def publish(folder: pathlib.Path, output: pathlib.Path) -> tuple[int, int]:
       of the sweep is damaged, or the output is not empty or cannot be written.
   """
   sweep = sweep_results.load(folder)
-  if not sweep.has_traces:
-    raise errors.ResultsError(
-        f'{folder}: published results; must be the folder of a sweep'
-    )
   runs = sweep.runs.values()
   if not any(run.is_done for run in runs):
     raise errors.ResultsError(f'{folder}: no job has finished yet')
@@ -144,7 +140,7 @@ def publish(folder: pathlib.Path, output: pathlib.Path) -> tuple[int, int]:
 
 
 def load(folder: pathlib.Path) -> sweep_results.Sweep:
-  """Reads published results; see `sweep_results.load`.
+  """Reads published results; see `result_folders.load`.
 
   Raises:
     ResultsError: If a file is missing or damaged. The message names it.

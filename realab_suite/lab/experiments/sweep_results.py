@@ -20,7 +20,6 @@ from realab_suite.config import task_names
 from realab_suite.evaluation import results
 from realab_suite.feedback import specs
 from realab_suite.lab.experiments import jobs
-from realab_suite.lab.experiments import requirements
 from realab_suite.lab.experiments import scheduler
 from realab_suite.lab.experiments import storage
 from realab_suite.lab.experiments import training
@@ -262,29 +261,18 @@ def by_run(planned: Sequence[Job]) -> dict[str, list[Job]]:
   return jobs_of_runs
 
 
-def is_sweep(folder: pathlib.Path) -> bool:
-  """Returns True for the folder of a sweep, or of published results."""
-  return any((folder / name).is_file() for name in (CONTENTS, scheduler.SWEEP))
-
-
 def load(folder: pathlib.Path) -> Sweep:
-  """Reads the folder of a sweep, or published results.
+  """Reads the folder of a sweep; for published results, see `result_folders`.
 
   Raises:
-    ResultsError: If it is neither, or a file in it is damaged. The message
+    ResultsError: If it is not one, or a file in it is damaged. The message
       names the file and, if possible, the line.
   """
-  if (folder / CONTENTS).is_file():
-    if problem := requirements.missing('pyarrow'):
-      raise errors.ResultsError(f'{folder}: published results: {problem}')
-    from realab_suite.lab.experiments import publishing
-
-    return publishing.load(folder)
-  if not is_sweep(folder):
+  if not (folder / scheduler.SWEEP).is_file():
     raise errors.ResultsError(
         f'{folder}: not the folder of a sweep: it has no {scheduler.SWEEP};'
-        ' must be an --output folder of realab_suite.launchers.sweep, or of'
-        ' realab_suite.launchers.publish'
+        ' must be an --output folder of realab_suite.launchers.sweep, or, if it'
+        ' is to be read only, of realab_suite.launchers.publish'
     )
   path = folder / scheduler.SWEEP
   description = validated(_Description, storage.read_json(path), path)

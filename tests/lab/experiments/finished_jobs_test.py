@@ -11,9 +11,9 @@ from realab_suite import errors
 from realab_suite.lab.experiments import engines
 from realab_suite.lab.experiments import experiment_specs
 from realab_suite.lab.experiments import jobs
+from realab_suite.lab.experiments import result_folders
 from realab_suite.lab.experiments import scheduler
 from realab_suite.lab.experiments import storage
-from realab_suite.lab.experiments import sweep_results
 from realab_suite.lab.experiments import training
 from tests.lab.experiments import fake_sweep
 
@@ -70,7 +70,7 @@ def _sweep(folder: pathlib.Path, *only: str) -> _Idle:
 
 def _report(folder: pathlib.Path) -> None:
   """Reads everything that a report shows."""
-  sweep = sweep_results.load(folder)
+  sweep = result_folders.load(folder)
   for run in sweep.runs.values():
     assert run.is_done
     assert run.traces
@@ -91,7 +91,7 @@ def test_a_job_without_done_json_is_run_again(folder):
   (_job_folder(folder) / storage.DONE).unlink()
   with pytest.raises(errors.ResultsError, match='not done, but started'):
     _sweep(folder, 'reward')
-  sweep = sweep_results.load(folder)
+  sweep = result_folders.load(folder)
   assert [job.run for job in sweep.unfinished] == ['reward']
 
 

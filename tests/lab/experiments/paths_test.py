@@ -18,10 +18,10 @@ from realab_suite import suite
 from realab_suite.feedback import specs
 from realab_suite.lab.experiments import experiment_specs
 from realab_suite.lab.experiments import jobs
+from realab_suite.lab.experiments import result_folders
 from realab_suite.lab.experiments import scheduler
 from realab_suite.lab.experiments import scripted
 from realab_suite.lab.experiments import storage
-from realab_suite.lab.experiments import sweep_results
 from tests.config import off_limits
 from tests.lab.experiments import small
 
@@ -86,7 +86,7 @@ def _load_sweep(folder: str) -> Any:
   }  # fmt: skip
   content = {'experiment': 'e', 'calibration': False, 'jobs': [job]}
   storage.write_json(sweep / scheduler.SWEEP, content)
-  return sweep_results.load(sweep)
+  return result_folders.load(sweep)
 
 
 def _run_scripted(**changes: Any) -> Any:

@@ -6,6 +6,7 @@ from realab_suite import errors
 from realab_suite.lab.experiments import curves
 from realab_suite.lab.experiments import published_files
 from realab_suite.lab.experiments import publishing
+from realab_suite.lab.experiments import result_folders
 from realab_suite.lab.experiments import scheduler
 from realab_suite.lab.experiments import sweep_results
 from realab_suite.launchers import publish
@@ -27,7 +28,7 @@ def _published(folder, tmp_path_factory):
 
 
 def test_all_that_reports_judge_is_published(folder, published):
-  ours, theirs = map(sweep_results.load, (folder, published))
+  ours, theirs = map(result_folders.load, (folder, published))
   assert theirs.experiment == ours.experiment
   assert theirs.is_calibration == ours.is_calibration
   assert theirs.runs.keys() == ours.runs.keys()
@@ -54,7 +55,7 @@ def test_the_same_results_give_the_same_bytes(folder, published, tmp_path):
 
 
 def test_published_results_have_no_actions(published):
-  run = next(iter(sweep_results.load(published).runs.values()))
+  run = next(iter(result_folders.load(published).runs.values()))
   with pytest.raises(errors.ResultsError, match='results have no actions'):
     _ = run.traces
 
@@ -64,7 +65,7 @@ def test_audits_are_published(tmp_path):
   (folder / scheduler.AUDITS).mkdir()
   (folder / scheduler.AUDITS / 'reward.json').write_text('{"verdict": "x"}')
   publishing.publish(folder, tmp_path / 'out')
-  assert sweep_results.load(tmp_path / 'out').audits == {
+  assert result_folders.load(tmp_path / 'out').audits == {
       'reward': {'verdict': 'x'}
   }
 
@@ -94,7 +95,7 @@ def test_a_damaged_file_is_named(folder, tmp_path, name, content, problem):
   if content is not None:
     path.write_bytes(content)
   with pytest.raises(errors.ResultsError) as raised:
-    sweep_results.load(tmp_path / 'out')
+    result_folders.load(tmp_path / 'out')
   assert problem in str(raised.value)
 
 
@@ -106,7 +107,7 @@ def test_a_row_that_lacks_a_figure_is_refused(folder, tmp_path):
     record['num_steps'] = None
   published_files.write_table(path, table)
   with pytest.raises(errors.ResultsError, match='num_steps: Field required'):
-    sweep_results.load(tmp_path / 'out')
+    result_folders.load(tmp_path / 'out')
 
 
 @pytest.mark.parametrize(
@@ -119,7 +120,7 @@ def test_a_row_of_no_job_or_part_is_refused(folder, tmp_path, column, problem):
   table[-1][column] = None
   published_files.write_table(path, table)
   with pytest.raises(errors.ResultsError, match=problem):
-    sweep_results.load(tmp_path / 'out')
+    result_folders.load(tmp_path / 'out')
 
 
 def test_an_index_of_no_configuration_is_refused(folder, tmp_path):
@@ -127,11 +128,11 @@ def test_an_index_of_no_configuration_is_refused(folder, tmp_path):
   path = tmp_path / 'out' / sweep_results.CONTENTS
   path.write_text(path.read_text().replace('"config":0', '"config":99'))
   with pytest.raises(errors.ResultsError, match='the index of no entry'):
-    sweep_results.load(tmp_path / 'out')
+    result_folders.load(tmp_path / 'out')
 
 
 def test_published_results_are_not_published_again(published, tmp_path):
-  with pytest.raises(errors.ResultsError, match='must be the folder of a sw'):
+  with pytest.raises(errors.ResultsError, match='not the folder of a sweep'):
     publishing.publish(published, tmp_path / 'out')
   assert not (tmp_path / 'out').exists()
 

@@ -1,0 +1,30 @@
+"""Folders of results: those of sweeps, and published ones."""
+
+import pathlib
+
+from realab_suite import errors
+from realab_suite.lab.experiments import requirements
+from realab_suite.lab.experiments import scheduler
+from realab_suite.lab.experiments import sweep_results
+
+
+def is_sweep(folder: pathlib.Path) -> bool:
+  """Returns True for the folder of a sweep, or of published results."""
+  names = sweep_results.CONTENTS, scheduler.SWEEP
+  return any((folder / name).is_file() for name in names)
+
+
+def load(folder: pathlib.Path) -> sweep_results.Sweep:
+  """Reads the folder of a sweep, or published results.
+
+  Raises:
+    ResultsError: If it is neither, or a file in it is damaged. The message
+      names the file and, if possible, the line.
+  """
+  if not (folder / sweep_results.CONTENTS).is_file():
+    return sweep_results.load(folder)
+  if problem := requirements.missing('pyarrow'):
+    raise errors.ResultsError(f'{folder}: published results: {problem}')
+  from realab_suite.lab.experiments import publishing
+
+  return publishing.load(folder)
