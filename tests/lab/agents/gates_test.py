@@ -10,6 +10,7 @@ import pytest
 from realab_suite import errors
 from realab_suite import trees
 from realab_suite.lab import agents
+from realab_suite.lab.agents import gate_settings
 from realab_suite.lab.agents import gates
 from realab_suite.lab.testing import probes
 from tests.lab.agents import toys
@@ -37,7 +38,7 @@ def _keeper(
       env.observation_spec(), env.action_spec(), num_envs, 1,
   )  # fmt: skip
   given = {'threshold': 2.0, 'fit_steps': 100, 'gradients': 4, **options}
-  keeper = gates.Gatekeeper(gates.Gate(**given), learner)
+  keeper = gates.Gatekeeper(gate_settings.Gate(**given), learner)
   keeper._state['is_open'] = True
   return keeper
 
