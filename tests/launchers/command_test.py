@@ -23,6 +23,7 @@ from realab_suite.launchers import renderers
 from realab_suite.launchers import sweep  # noqa: F401 - defines --workers.
 from realab_suite.launchers import train  # noqa: F401 - defines --parent.
 from tests import patience
+from tests import registries
 from tests.lab.experiments import small
 from tests.launchers import in_process
 
@@ -138,7 +139,7 @@ def test_wrong_names_of_modules_are_refused(name):
     assert str(raised.value).endswith('for several, repeat the option')
 
 
-def test_every_launcher_imports_the_user_s_module(tmp_path):
+def test_every_launcher_imports_the_user_s_module(tmp_path, monkeypatch):
   # The register, the provider, the task and the design of the page.
   page = (_ROOT / 'docs' / 'your_own.md').read_text()
   blocks = re.findall(r'```python\n(.*?)```', page, re.DOTALL)
@@ -152,8 +153,10 @@ def test_every_launcher_imports_the_user_s_module(tmp_path):
       '--max_steps=3', '--import=mine',
       f'--design={tmp_path / "watched.yaml"}', f'--output={tmp_path / "out"}',
   ]  # fmt: skip
-  ran = _run(*arguments, PYTHONPATH=str(tmp_path))
-  assert (ran.returncode, ran.stderr) == (0, '')
+  monkeypatch.syspath_prepend(str(tmp_path))
+  with registries.preserved():
+    ended = in_process.run(compare, *arguments)
+  assert (ended.status, ended.stderr) == (0, '')
   [row] = small.rows(tmp_path / 'out')
   assert row.info.domain == 'stay'
   for module in ('compare', 'train', 'sweep', 'report', 'serve'):

@@ -14,12 +14,13 @@ _PROGRAM = (
 _EXPERIMENT = {
     **small.EXPERIMENT,
     'max_steps': 20,
-    'baselines': ['random'],
+    'baselines': [],
+    'seeds': [0],
     'training': {
         'num_envs': 2,
-        'steps': 2_000,
-        'checkpoint_every': 200,
-        'curve_every': 200,
+        'steps': 1_000,
+        'checkpoint_every': 100,
+        'curve_every': 100,
     },
 }
 

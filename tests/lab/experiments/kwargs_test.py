@@ -89,14 +89,13 @@ def test_arguments_reach_training_evaluation_baselines_and_replays(
 
 
 @pytest.mark.camera
-def test_a_learner_that_has_only_a_camera_is_trained_and_evaluated(tmp_path):
+def test_a_camera_alone_reaches_training_evaluation_and_replays(tmp_path):
   job = _plan(['camera'])[-1]
   seen = []
-  make_learner = training.make_learner
 
   def make(job, batch):
     seen.append(batch.observation_spec())
-    return make_learner(job, batch)
+    return fake_learner.make(job, batch)
 
   with mock.patch.object(training, 'make_learner', make):
     path = training.run(job, tmp_path, training.Options(lambda line: None))
