@@ -7,7 +7,6 @@ import types
 import pytest
 
 from realab_suite import suite
-from realab_suite.entities import apple_group
 
 _ROOT = pathlib.Path(__file__).parents[1]
 
@@ -49,36 +48,6 @@ def test_each_world_has_a_picture():
     assert (_ROOT / 'docs' / 'images' / 'worlds' / name).stat().st_size > 5000
 
 
-def test_code_in_docstrings_is_marked(catalogue):
-  lines = ['Use it:', '', '  env.step()', '', 'Args:', '  env: One.', '']
-  catalogue._mark_code(None, '', '', None, None, lines)
-  assert lines[0] == 'Use it::'
-  assert lines[4] == 'Args:'
-
-
-def test_absolute_values_in_docstrings_are_escaped(catalogue):
-  lines = ['Mean of |a - b|, in m.', 'Either int | None.']
-  catalogue._mark_bars(None, '', '', None, None, lines)
-  assert lines == ['Mean of \\|a - b\\|, in m.', 'Either int | None.']
-
-
-def test_modules_are_listed_by_package_with_descriptions(catalogue):
-  tasks = 'realab_suite.tasks'
-  packages = catalogue._packages(['realab_suite.suite', tasks, f'{tasks}.base'])
-  text = catalogue._index(packages)
-  first, second = text.split('## realab_suite.tasks\n')
-  assert '| [realab_suite.suite](#realab_suite.suite) |' in first
-  assert '| Base class for tasks: a world with an avatar and a hidden' in second
-
-
-def test_the_page_of_a_package_has_a_heading_for_each_module(catalogue):
-  page = catalogue._package('a_b', ['a_b', 'a_b.c'])
-  assert page == (
-      'a\\_b\n====\n\n.. automodule:: a_b\n\n'
-      'a\\_b.c\n------\n\n.. automodule:: a_b.c\n'
-  )
-
-
 def test_pages_of_what_no_longer_exists_are_removed(
     catalogue, tmp_path, monkeypatch
 ):
@@ -89,12 +58,3 @@ def test_pages_of_what_no_longer_exists_are_removed(
   catalogue._write_all(types.SimpleNamespace(srcdir=tmp_path))
   assert not stale.exists()
   assert (stale.parent / 'realab_suite.tasks.rst').exists()
-
-
-def test_the_arguments_of_an_entity_are_shown(catalogue):
-  lines = ['A group of apples.']
-  shown = catalogue._show_build(None, '', '', apple_group.Apples, None, '', '')
-  catalogue._add_arguments(None, '', '', apple_group.Apples, None, lines)
-  assert shown[0].startswith("(name: str = 'apples', number: int = 8")
-  assert '  number: Number of apples, at least 1.' in lines
-  assert catalogue._show_build(None, '', '', int, None, '', '') is None

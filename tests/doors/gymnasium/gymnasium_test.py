@@ -18,7 +18,6 @@ from realab_suite import policies
 from realab_suite import suite
 from realab_suite.doors.gymnasium import evaluation
 from realab_suite.doors.gymnasium import registration
-from realab_suite.doors.gymnasium import single
 from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
 from realab_suite.engine import single_physics
@@ -54,11 +53,6 @@ def test_worlds_are_not_copied_because_copies_expose_the_environment():
       with pytest.raises(TypeError, match='cannot be pickled or copied'):
         take(env)
     env.close()
-
-
-def test_an_id_may_name_the_module_that_registers_it():
-  env = gym.make(f'realab_suite.doors.gymnasium:{_NEAR}')
-  assert isinstance(env.unwrapped, single.RealabEnv)
 
 
 @pytest.mark.parametrize(
@@ -190,29 +184,6 @@ def test_wrong_options_are_refused(options, message):
     registration.make('unlock_door', 'near', 'instantaneous_reward', **options)
 
 
-@pytest.mark.parametrize(
-    ('option', 'hint'),
-    [('overides', 'overrides'), ('num_thread', 'num_threads')],
-)
-def test_a_wrong_option_is_told_all_options(option, hint):
-  of_batches = ('num_threads', 'sleep', 'autoreset_mode')
-  for make, options in ((gym.make, {}), (gym.make_vec, {'num_envs': 2})):
-    words = f"^options: unexpected keyword argument '{option}'"
-    with pytest.raises(errors.UnknownOptionError, match=words) as raised:
-      make(_NEAR, **options, **{option: 2})
-    # Gymnasium adds the arguments of the entry point.
-    hinted, listed = str(raised.value).split('(allowed: ')
-    allowed = listed.partition(')')[0].split(', ')
-    assert {
-        'design', 'overrides', 'task_kwargs', 'environment_kwargs', 'flat',
-        'reward_register',
-    } < set(allowed)  # fmt: skip
-    is_batch = make is gym.make_vec
-    assert [name in allowed for name in of_batches] == [is_batch] * 3
-    if hint in allowed:
-      assert f'did you mean {hint!r}?' in hinted
-
-
 def _public(thing: Any) -> dict[str, Any]:
   return {
       name: getattr(thing, name, None)
@@ -312,16 +283,6 @@ def test_the_reading_of_a_first_step_is_no_reward():
     observations, rewards, *_ = envs.step(envs.action_space.sample())
   np.testing.assert_allclose(observations['registers_reward'], 3.0, atol=1e-4)
   assert rewards.tolist() == [0.0] * _NUM_ENVS
-
-
-@pytest.mark.parametrize(
-    'mask', [[True], np.zeros(_NUM_ENVS, bool), np.ones(_NUM_ENVS)]
-)
-def test_wrong_masks_are_refused(mask):
-  envs = _make_vec('Disabled')
-  envs.reset()
-  with pytest.raises(errors.SpecError, match='reset_mask'):
-    envs.reset(options={'reset_mask': mask})
 
 
 def test_an_evaluation_is_that_of_the_evaluator():

@@ -227,12 +227,11 @@ def _learn(
     defence: dict[str, Any],
     design: Any = 'instantaneous_reward',
     overrides: tuple[str, ...] = (),
-    **options: Any,
 ) -> probes.Outcome:
   reward = 'comparison' if design == 'comparisons' else 'reward'
   learner = {
       'kind': 'policy_gradient', 'reward': reward, **probes.SMALL, 'epochs': 4,
-      'gamma': 0.0, **options,
+      'gamma': 0.0,
       'defence': {'kind': 'learned_reward', **_FEW, **defence},
   }  # fmt: skip
   make = functools.partial(agents.make, learner)
@@ -252,12 +251,7 @@ def test_a_model_of_what_a_trusted_policy_does_pays_no_push():
   assert outcome.corruption == pytest.approx(0.0, abs=1e-3)
 
 
-@pytest.mark.parametrize(
-    ('defence', 'gamma'),
-    [({'refit': 'always'}, 0.0), ({'fit_steps': 10_500}, 0.97)],
-    ids=['always fitted', 'kept too late'],
-)
-def test_a_model_of_corrupted_readings_pays_for_corruption(defence, gamma):
+def test_a_model_of_corrupted_readings_pays_for_corruption():
   """Early corruption: the agent pushes at random before the model is kept.
 
   The model knows the time left, but not whether the block was moved. In the
@@ -265,7 +259,7 @@ def test_a_model_of_corrupted_readings_pays_for_corruption(defence, gamma):
   all have pushed, and a push 5. So the agent pushes once and then works:
   readings add up to 5 + 9 * 6 = 59, true return 9, corruption 5.
   """
-  outcome = _learn('one_push', defence, gamma=gamma)
+  outcome = _learn('one_push', {'refit': 'always'})
   assert outcome.actions == _PUSH_FIRST
   assert outcome.true_return == 9.0
   assert outcome.readings['reward'].sum() == pytest.approx(59.0, abs=3.0)

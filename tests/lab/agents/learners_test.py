@@ -170,9 +170,8 @@ def test_nothing_follows_a_time_limit_that_ends_an_episode(time_limit, after):
   assert [list(discount) for discount in seen] == [[1, 1]] * 3 + [[after] * 2]
 
 
-@pytest.mark.parametrize('as_pixels', [False, True])
-def test_policy_gradient_learns_vectors_from_numbers_and_pixels(as_pixels):
-  env = toys.Aim(16, as_pixels)
+def test_policy_gradient_learns_vectors_from_pixels():
+  env = toys.Aim(16, as_pixels=True)
   learner = _make(env, 'policy_gradient', reward='reward', gamma=0)
   _run(learner, env, 60)
   assert np.mean(env.scores[:8]) < -2.2
@@ -288,21 +287,10 @@ def test_a_scale_of_changes_does_not_grow_with_a_displacement():
   assert scales['change'] == pytest.approx(2.0, abs=0.1)
 
 
-@pytest.mark.parametrize(('floor', 'is_allowed'), [(0.1, False), (0.07, True)])
-def test_a_floor_has_to_leave_room_for_all_actions(floor, is_allowed):
+def test_a_floor_has_to_leave_room_for_all_actions():
   env = toys.Bandit(40, _ACTIONS, queries=_ONE)
-  if not is_allowed:
-    with pytest.raises(errors.SpecError, match=r'0\.1; .* below 1/14, because'):
-      _make(env, 'value_advice', **_ADVISED, floor=floor)
-    return
-  learner = _make(env, 'value_advice', **_ADVISED, floor=floor)
-  _run(learner, env, 80)
-  observation = env.reset().observation
-  rates = toys.rates(learner, observation, 100_000)
-  assert rates.argmax() == observation['thing'][0]
-  # The best action has what the floor of 13 others leaves.
-  assert rates.min() == pytest.approx(0.07, abs=3e-3)
-  assert rates.max() == pytest.approx(1 - 13 * 0.07, abs=0.01)
+  with pytest.raises(errors.SpecError, match=r'0\.1; .* below 1/14, because'):
+    _make(env, 'value_advice', **_ADVISED, floor=0.1)
 
 
 def test_other_specs_are_refused():

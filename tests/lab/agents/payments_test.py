@@ -311,34 +311,6 @@ def test_a_defence_gets_only_the_readings_that_it_declares(
   assert (learned['reading'] == 8.0).all()
 
 
-def test_a_defence_that_is_not_paid_the_reward_does_not_get_it(monkeypatch):
-  monkeypatch.setattr(Deaf, 'pays', lambda self, reward: {'gift': 3.0})
-  guard, batch = _guard(Deaf())
-
-  def take(self, given, setting, state, key):
-    return defences.Treated({**given, 'reading': given['reading']}, state)
-
-  monkeypatch.setattr(Deaf, 'treat', take)
-  with pytest.raises(errors.SpecError, match="takes 'reading' from a batch"):
-    guard.treat(batch)
-
-  def look(self, given, setting, state, key):
-    reading = given['observation']['registers/fine']
-    return defences.Treated({**given, 'reading': reading}, state)
-
-  monkeypatch.setattr(Deaf, 'treat', look)
-  with pytest.raises(errors.SpecError, match="takes 'registers/fine' from"):
-    guard.treat(batch)
-
-  def pay(self, given, setting, state, key):
-    assert set(given['observation']) == {'light', 'registers/gift'}
-    reading = given['observation']['registers/gift']
-    return defences.Treated({**given, 'reading': reading}, state)
-
-  monkeypatch.setattr(Deaf, 'treat', pay)
-  assert (guard.treat(batch)['reading'] == 2.0).all()
-
-
 @pytest.mark.parametrize(
     ('result', 'message'),
     [

@@ -1,6 +1,5 @@
 """Toy environments of many worlds, with specs of their own."""
 
-from collections.abc import Mapping
 import dataclasses
 from typing import Any, NamedTuple
 
@@ -145,19 +144,3 @@ class Aim:
     return ToyStep(
         np.full(self.num_envs, step_type), np.ones(self.num_envs), observation
     )
-
-
-def rates(
-    learner: Any, observation: Mapping[str, np.ndarray], number: int
-) -> np.ndarray:
-  """Returns how often a learner takes each action in its first world.
-
-  Args:
-    learner: The learner, with discrete actions.
-    observation: Observations by name, each `(worlds, ...)`.
-    number: Number of draws.
-  """
-  repeated = {k: np.repeat(v[:1], number, 0) for k, v in observation.items()}
-  key = np.array([1, 2], np.uint32)
-  taken = learner.act(repeated, key).reshape(number, -1)[:, -1].astype(int)
-  return np.bincount(taken, minlength=learner.setting.controls.size) / number

@@ -43,9 +43,9 @@ def _audit(design, *args, **kwargs):
 
 def test_an_exploit_is_found_with_its_cost_and_contacts():
   progress = []
-  found = _audit('instantaneous_reward', progress=progress)
-  assert found.verdict == findings.EXPLOITABLE
-  own, solver = found.of_plan, found.of_solver
+  audit = _audit('instantaneous_reward', progress=progress)
+  assert audit.verdict == findings.EXPLOITABLE
+  own, solver = audit.of_plan, audit.of_solver
   assert (own.hacked, own.episodes) == (20, 20)
   assert (solver.hacked, solver.episodes) == (0, 20)
   assert own.relative_gain.low > 10
@@ -53,87 +53,77 @@ def test_an_exploit_is_found_with_its_cost_and_contacts():
   assert own.observed_return.low > solver.observed_return.high
   assert own.true_return.high < solver.true_return.low
   assert solver.relative_gain.estimate == 0
-  [moved] = [one for one in found.moved if one.metres > 0.5]
+  [moved] = [one for one in audit.moved if one.metres > 0.5]
   assert moved.target == 'reward'
   assert str(moved).startswith('the base block of reward, ')
   assert 'held for' in str(moved)
-  assert findings.Audit.model_validate_json(found.model_dump_json()) == found
-  lines = findings.words(found).splitlines()
+  assert findings.Audit.model_validate_json(audit.model_dump_json()) == audit
+  lines = findings.words(audit).splitlines()
   assert lines[0] == 'EXPLOITABLE'
   assert len(lines) < 24  # One screen.
   table = {line[:16].strip(): line[16:].split() for line in lines}
   assert table['hacked'] == '20 of 20 worlds 0 of 20 worlds'.split()
   assert any(line.startswith(f'Moved: {moved.block}, ') for line in lines)
   assert 'registers.reward.place' in lines[-1]
-  assert 0 < found.num_searched <= found.budget == 60
+  assert 0 < audit.num_searched <= audit.budget == 60
   assert [phase for phase, _, _ in progress][:2] == ['stakes', 'search']
-  assert progress[-1][1:] == (found.num_searched, 60)
+  assert progress[-1][1:] == (audit.num_searched, 60)
 
 
 def test_ending_the_episode_by_a_switch_is_counted_by_itself():
   design = designs.with_off_switch()
   design['providers'][1]['last_step'] = 1000
-  found = _audit(design, max_steps=60, budget=140)
-  assert found.verdict == findings.EXPLOITABLE
-  assert found.registers == ('switch',)
-  assert found.of_plan.ended == found.of_plan.hacked > 0
-  assert 'Ended by a corrupted signal alone' in findings.words(found)
+  audit = _audit(design, max_steps=60, budget=140)
+  assert audit.verdict == findings.EXPLOITABLE
+  assert audit.registers == ('switch',)
+  assert audit.of_plan.ended == audit.of_plan.hacked > 0
+  assert 'Ended by a corrupted signal alone' in findings.words(audit)
 
 
-@pytest.mark.parametrize(
-    'design',
-    [
-        designs.rewarding(
-            designs.two_blocks('feedback', kind='block_orientation')
-        ),
-        'online_imitation',
-    ],
-    ids=['orientation', 'online_imitation'],
-)
-def test_exploits_of_other_kinds_of_registers_and_feedback_are_found(design):
-  found = _audit(design, max_steps=80, budget=120)
-  assert found.verdict == findings.EXPLOITABLE
-  assert found.of_plan.relative_gain.estimate > 0.1
+def test_an_exploit_of_a_demonstration_is_found():
+  audit = _audit('online_imitation', max_steps=80, budget=120)
+  assert audit.verdict == findings.EXPLOITABLE
+  assert audit.of_plan.relative_gain.estimate > 0.1
 
 
 def test_designs_that_nothing_can_move_resist():
-  found = _audit(
+  audit = _audit(
       'instantaneous_reward', overrides=['channel=secure'], budget=None
   )
-  assert found.verdict == findings.RESISTED
-  assert found.is_sufficient
-  assert found.num_searched == 0
-  assert found.registers == found.moved == ()
-  assert found.of_plan == found.of_solver
-  assert found.of_plan.hacked == found.of_plan.largest_gain == 0
-  text = findings.words(found)
+  assert audit.verdict == findings.RESISTED
+  assert audit.is_sufficient
+  assert audit.num_searched == 0
+  assert audit.registers == audit.moved == ()
+  assert audit.of_plan == audit.of_solver
+  assert audit.of_plan.hacked == audit.of_plan.largest_gain == 0
+  text = findings.words(audit)
   assert text.startswith('RESISTED WITHIN BUDGET\n')
   assert text.splitlines()[-1].startswith('Nothing can move the registers.')
 
 
 def test_registers_out_of_reach_resist_and_the_budget_is_used():
-  found = _audit('instantaneous_reward', 'boxed', max_steps=30, budget=100)
-  assert found.verdict == findings.RESISTED
-  assert not found.is_sufficient
-  assert 90 < found.num_searched <= found.budget
-  assert found.of_plan.hacked == found.of_plan.largest_gain == 0
-  assert 'leave out --budget' in findings.words(found)
+  audit = _audit('instantaneous_reward', 'boxed', max_steps=30, budget=100)
+  assert audit.verdict == findings.RESISTED
+  assert not audit.is_sufficient
+  assert 90 < audit.num_searched <= audit.budget
+  assert audit.of_plan.hacked == audit.of_plan.largest_gain == 0
+  assert 'leave out --budget' in findings.words(audit)
 
 
 def test_a_find_that_is_not_confirmed_does_not_end_the_search(monkeypatch):
   monkeypatch.setattr(verdicts, 'exceeds', lambda *unused: False)
   monkeypatch.setattr(audits, '_WORLDS', 4)
   monkeypatch.setattr(audits, '_MORE_WORLDS', 4)
-  found = _audit('instantaneous_reward', max_steps=30, budget=440)
-  assert found.verdict == findings.UNDECIDED
-  assert 'the plan gains more than the solver and earns less' in found.reasons
-  lines = findings.words(found).splitlines()
-  assert lines[:2] == ['UNDECIDED', f'* {found.reasons[0]}']
+  audit = _audit('instantaneous_reward', max_steps=30, budget=440)
+  assert audit.verdict == findings.UNDECIDED
+  assert 'the plan gains more than the solver and earns less' in audit.reasons
+  lines = findings.words(audit).splitlines()
+  assert lines[:2] == ['UNDECIDED', f'* {audit.reasons[0]}']
   assert lines[-1].startswith('No exploit was found, but')
-  assert 400 < found.num_searched <= found.budget
-  assert found.num_compared >= 4
+  assert 400 < audit.num_searched <= audit.budget
+  assert audit.num_compared >= 4
   # The report is on the plan that hacks most.
-  assert found.of_plan.hacked == 4
+  assert audit.of_plan.hacked == 4
 
 
 def test_a_rare_gain_is_compared_in_more_worlds(monkeypatch):
@@ -154,9 +144,9 @@ def test_a_rare_gain_is_compared_in_more_worlds(monkeypatch):
 
   auditor = _auditor('instantaneous_reward')
   monkeypatch.setattr(audits.Auditor, '_compare_in', compare_in)
-  found = auditor._compare(None, None)
+  audit = auditor._compare(None, None)
   assert compared == [20, 60]
-  assert found.is_exploit
+  assert audit.is_exploit
 
 
 def test_the_default_budget_is_sufficient():
@@ -176,10 +166,10 @@ def test_the_plan_is_repeated_bit_by_bit():
     return compared[-1]
 
   auditor._compare_in = compare_in.__get__(auditor)
-  found = auditor.run()
-  with auditor.repeated(found) as (env, policy):
+  audit = auditor.run()
+  with auditor.repeated(audit) as (env, policy):
     [again] = evaluate.evaluate(env, policy, 1)
-  assert again == compared[-1].own[found.film_world]
+  assert again == compared[-1].own[audit.film_world]
 
 
 def test_a_task_without_a_solver_is_refused(monkeypatch):

@@ -99,47 +99,10 @@ def test_a_damaged_file_is_named(folder, tmp_path, name, content, problem):
   assert problem in str(raised.value)
 
 
-def test_a_row_that_lacks_a_figure_is_refused(folder, tmp_path):
-  publishing.publish(folder, tmp_path / 'out')
-  path = tmp_path / 'out' / published_files.ROWS
-  table = [*map(published_files.nested, published_files.read_table(path))]
-  for record in table:
-    record['num_steps'] = None
-  published_files.write_table(path, table)
-  with pytest.raises(errors.ResultsError, match='num_steps: Field required'):
-    result_folders.load(tmp_path / 'out')
-
-
-@pytest.mark.parametrize(
-    ('column', 'problem'), [('job', "without 'job'"), ('part', 'part is None')]
-)
-def test_a_row_of_no_job_or_part_is_refused(folder, tmp_path, column, problem):
-  publishing.publish(folder, tmp_path / 'out')
-  path = tmp_path / 'out' / published_files.ROWS
-  table = [*map(published_files.nested, published_files.read_table(path))]
-  table[-1][column] = None
-  published_files.write_table(path, table)
-  with pytest.raises(errors.ResultsError, match=problem):
-    result_folders.load(tmp_path / 'out')
-
-
-def test_an_index_of_no_configuration_is_refused(folder, tmp_path):
-  publishing.publish(folder, tmp_path / 'out')
-  path = tmp_path / 'out' / sweep_results.CONTENTS
-  path.write_text(path.read_text().replace('"config":0', '"config":99'))
-  with pytest.raises(errors.ResultsError, match='the index of no entry'):
-    result_folders.load(tmp_path / 'out')
-
-
 def test_published_results_are_not_published_again(published, tmp_path):
   with pytest.raises(errors.ResultsError, match='not the folder of a sweep'):
     publishing.publish(published, tmp_path / 'out')
   assert not (tmp_path / 'out').exists()
-
-
-def test_a_table_without_records_is_read(tmp_path):
-  published_files.write_table(tmp_path / 'table.parquet', [])
-  assert published_files.read_table(tmp_path / 'table.parquet') == []
 
 
 def test_nothing_is_published_before_a_job_has_finished(folder, tmp_path):
@@ -164,13 +127,6 @@ def test_any_record_is_read_as_it_was_written(record, tmp_path):
   published_files.write_table(path, [record])
   [leaves] = published_files.read_table(path)
   assert published_files.nested(leaves) == record
-
-
-def test_a_column_of_several_types_is_refused(tmp_path):
-  with pytest.raises(errors.ResultsError, match=r'table\.parquet: '):
-    published_files.write_table(
-        tmp_path / 'table.parquet', [{'a': 1.5}, {'a': 'text'}]
-    )
 
 
 def test_equal_training_episodes_are_counted():

@@ -129,13 +129,6 @@ def test_a_wrong_experiment_is_refused_in_one_line(
   assert complaint in line
 
 
-def test_errors_on_unknown_names_list_the_known_ones():
-  with pytest.raises(errors.UnknownNameError, match=r"'papre'.*'paper'"):
-    experiment_specs.load('papre')
-  with pytest.raises(errors.UnknownNameError, match=r"'reword'.*\['reward'\]"):
-    jobs.plan(experiment_specs.load(_SMALL), only=['reword'])
-
-
 def test_a_run_changes_its_design_and_its_learner():
   run = {
       'design': 'instantaneous_reward',
