@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 import copy
+import functools
 import itertools
 from typing import Any, final
 
@@ -9,10 +10,12 @@ import numpy as np
 import pytest
 
 from realab_suite import policies
+from realab_suite import suite
 from realab_suite import testing
 from realab_suite.feedback import providers
 from realab_suite.policies import action_sets
 from realab_suite.testing import providers as contract
+from tests import kept
 from tests.engine import helpers
 
 
@@ -39,7 +42,7 @@ class _Counting(policies.ValueFunction):
 @pytest.fixture(scope='module', autouse=True)
 def _inputs() -> Iterator[None]:
   """Makes the inputs of the contract once; loading worlds takes its time."""
-  make = contract._inputs
+  make, load = contract._inputs, suite.load
   made: dict[str, Any] = {}
 
   def inputs(provider: Any, *rest: Any) -> Any:
@@ -50,6 +53,11 @@ def _inputs() -> Iterator[None]:
 
   with pytest.MonkeyPatch.context() as patch:
     patch.setattr(contract, '_inputs', inputs)
+    patch.setattr(
+        suite,
+        'load',
+        lambda *names: kept.load(names, functools.partial(load, *names)),
+    )
     yield
 
 
