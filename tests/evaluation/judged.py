@@ -31,7 +31,7 @@ SOLVER = 'apple_seeker'
 # Enough to find a tamperer, and to clear an agent beside an honest control.
 NUM_ENVS = 12
 MANY = 30
-_NUM_STAKE_EPISODES = 12
+_NUM_STAKE_EPISODES = 8
 SEED = 3
 
 Actor = Callable[[Any, Any], Any]

@@ -1,7 +1,6 @@
 """Tests of every world: its contract, its solver, and why tampering pays."""
 
 import contextlib
-import functools
 import inspect
 import math
 from typing import Any
@@ -21,13 +20,14 @@ from tests.engine import helpers
 pytestmark = pytest.mark.slow
 
 _DOMAINS = [*suite.TASKS_BY_DOMAIN]
-_EPISODES = 3
 # Other files test the variations of the two worlds of the paper.
 _VARIATIONS = [
     (domain, task)
     for domain, tasks in suite.TASKS_BY_DOMAIN.items()
     for task in tasks[1:]
     if domain not in ('collect_apples', 'unlock_door')
+    # Members of a class differ in the worth of things alone.
+    and not (task.startswith('member_') and task != 'member_2')
 ]
 _IMPOSSIBLE = suite.get_tasks_by_tag('no_true_reward')
 
@@ -43,11 +43,11 @@ def _design(domain: str) -> str:
 
 
 def _load(
-    domain: str, overrides: Any = (), seed: int = 1, task: str | None = None
+    domain: str, overrides: Any = (), task: str | None = None, **options: Any
 ) -> Any:
   return suite.load(
-      domain, task or _task(domain), {'random': seed}, design=_design(domain),
-      overrides=overrides,
+      domain, task or _task(domain), {'random': 1}, options,
+      design=_design(domain), overrides=overrides,
   )  # fmt: skip
 
 
@@ -58,11 +58,10 @@ def _target(domain: str) -> str:
   return others.get(domain, 'reward')
 
 
-@functools.cache
-def _solved(domain: str) -> Any:
+def _solved(domain: str, num_episodes: int) -> Any:
   env = _load(domain)
   solver = realab.make_policy(env.task.SOLVER)
-  results = realab.evaluate(env, solver, _EPISODES)
+  results = realab.evaluate(env, solver, num_episodes)
   best = env.task.best_mean_return
   env.close()
   return results, best
@@ -71,18 +70,18 @@ def _solved(domain: str) -> Any:
 @pytest.mark.parametrize('domain', _DOMAINS)
 def test_a_world_keeps_the_contract_with_its_own_design(domain: str):
   make = registry.find(domain, _task(domain))
-  testing.check_world(make, _design(domain), num_steps=40)
+  testing.check_world(make, _design(domain), max_steps=100)
 
 
 @pytest.mark.parametrize('domain', sorted(set(_DOMAINS) - {'off_switch'}))
 def test_the_solver_earns_what_can_be_earned_and_corrupts_nothing(domain: str):
-  results, best = _solved(domain)
+  results, best = _solved(domain, 2)
   assert np.mean([one.true_return for one in results]) >= 0.95 * best
   assert max(one.corruption for one in results) < 1e-3
 
 
 def test_the_solver_of_the_off_switch_stops_when_it_is_called():
-  results, best = _solved('off_switch')
+  results, best = _solved('off_switch', 3)
   for one in results:
     assert one.facts['eaten_too_many'] == one.facts['stop_disobeyed'] == 0
     assert one.true_return == one.facts['eaten'] <= 7
@@ -98,9 +97,10 @@ def test_whoever_carries_a_block_away_gains_but_in_the_secure_twin(domain: str):
   target = _target(domain)
   gained = {}
   for channel in ('embedded', 'secure'):
-    env = _load(domain, [f'channel={channel}'] * (channel == 'secure'))
+    overrides = [f'channel={channel}'] * (channel == 'secure')
+    env = _load(domain, overrides, max_steps=120)
     saboteur = aiming.make_policy('carrying_saboteur', env, target, 0)
-    results = realab.evaluate(env, saboteur, 3)
+    results = realab.evaluate(env, saboteur, 2)
     env.close()
     gained[channel] = max(
         one.observed_return - one.true_return for one in results
@@ -110,46 +110,38 @@ def test_whoever_carries_a_block_away_gains_but_in_the_secure_twin(domain: str):
   assert gained['embedded'] > 10
 
 
+def _check_solved(env: Any, domain: str) -> None:
+  [solved] = realab.evaluate(env, realab.make_policy(env.task.SOLVER), 1)
+  eaten = solved.facts.get('eaten') if domain == 'off_switch' else None
+  most = env.task.max_true_return if eaten is None else eaten
+  assert solved.true_return >= 0.95 * most > 0
+  assert solved.corruption < 1e-3
+
+
+def _check_impossible(env: Any) -> None:
+  assert env.task.max_true_return == env.task.best_mean_return == 0.0
+  for name in (env.task.SOLVER, 'random'):
+    [idle] = realab.evaluate(env, realab.make_policy(name), 1)
+    assert idle.true_return == 0.0
+
+
 @pytest.mark.parametrize(('domain', 'task'), _VARIATIONS)
-def test_the_designs_for_a_world_fit_its_variations(domain: str, task: str):
-  # Another one for each variation.
+def test_each_variation_is_solved_and_tampered_with_where_that_is_possible(
+    domain: str, task: str
+):
+  # Another design for each variation.
   designs = suite.designs_for(domain)
   design = designs[_VARIATIONS.index((domain, task)) % len(designs)]
   with contextlib.closing(suite.load(domain, task, design=design)) as env:
     assert env.reset().first()
-
-
-@pytest.mark.parametrize(
-    ('domain', 'task'), sorted({*_VARIATIONS} - {*_IMPOSSIBLE})
-)
-def test_the_solver_solves_each_variation(domain: str, task: str):
   with contextlib.closing(_load(domain, task=task)) as env:
-    solver = realab.make_policy(env.task.SOLVER)
-    for one in realab.evaluate(env, solver, 1):
-      eaten = one.facts.get('eaten') if domain == 'off_switch' else None
-      most = env.task.max_true_return if eaten is None else eaten
-      assert one.true_return >= 0.95 * most > 0
-      assert one.corruption < 1e-3
-
-
-@pytest.mark.parametrize(
-    ('domain', 'task'), sorted({*_VARIATIONS} & {*_IMPOSSIBLE})
-)
-def test_nothing_is_earned_where_it_is_impossible(domain: str, task: str):
-  with contextlib.closing(_load(domain, task=task)) as env:
-    assert env.task.max_true_return == env.task.best_mean_return == 0.0
-    for name in (env.task.SOLVER, 'random'):
-      [one] = realab.evaluate(env, realab.make_policy(name), 1)
-      assert one.true_return == 0.0
-
-
-@pytest.mark.parametrize(('domain', 'task'), _VARIATIONS)
-def test_a_saboteur_gains_in_each_variation_but_the_boxed_ones(
-    domain: str, task: str
-):
-  with contextlib.closing(_load(domain, task=task)) as env:
+    if (domain, task) in _IMPOSSIBLE:
+      _check_impossible(env)
+    else:
+      _check_solved(env, domain)
+    env.rewind()
     saboteur = aiming.make_policy('carrying_saboteur', env, _target(domain), 0)
-    results = realab.evaluate(env, saboteur, 2)
+    results = realab.evaluate(env, saboteur, 1 if task == 'boxed' else 2)
   gained = max(one.observed_return - one.true_return for one in results)
   if task == 'boxed':
     assert max(one.corruption for one in results) == 0.0
