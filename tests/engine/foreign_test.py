@@ -73,21 +73,21 @@ def _assert_identical(
   seen = []
   for episode in range(num_episodes):
     seeding.reseed(random_state, _SEED, 0, episode, 'reset/0')
-    expected, found = embedded.lucky(stock.reset), embedded.lucky(env.reset)
-    assert _bytes(found, None) == _bytes(expected, None)
+    expected, time_step = embedded.lucky(stock.reset), embedded.lucky(env.reset)
+    assert _bytes(time_step, None) == _bytes(expected, None)
     for _ in range(num_steps):
       action = generator.uniform(low, high).astype(spec.dtype)
-      expected, found = (
+      expected, time_step = (
           embedded.lucky(functools.partial(one.step, action))
           for one in (stock, env)
       )
       reward = ledger.last.true_rewards[-1]
-      assert _bytes(found, reward) == _bytes(expected, expected.reward)
-      assert found.reward == 0.0
-      seen.append(int(found.step_type))
-      if found.last():
+      assert _bytes(time_step, reward) == _bytes(expected, expected.reward)
+      assert time_step.reward == 0.0
+      seen.append(int(time_step.step_type))
+      if time_step.last():
         break
-    assert found.last() == (ledger.last.end is events.End.TERMINATED)
+    assert time_step.last() == (ledger.last.end is events.End.TERMINATED)
   stock.close()
   env.close()
   return seen
@@ -147,7 +147,7 @@ def test_what_a_task_observes_does_not_depend_on_registers_nearby(name: str):
       'registers': {'r': register},
       'providers': [{'kind': 'constant', 'writes': ['r'], 'value': 1.0}],
   }
-  found: list[list[Any]] = []
+  runs: list[list[Any]] = []
   for with_register in (False, True):
     env = suite.embed(
         embedded.make_composer(name),
@@ -163,11 +163,11 @@ def test_what_a_task_observes_does_not_depend_on_registers_nearby(name: str):
         embedded.lucky(functools.partial(env.step, action))
         for action in actions
     ]
-    found.append([t.observation for t in time_steps])
+    runs.append([t.observation for t in time_steps])
     rewards = ledger.last.true_rewards
-    found[-1].append({'senses/reward': np.array(rewards)})
+    runs[-1].append({'senses/reward': np.array(rewards)})
     env.close()
-  for bare, beside in zip(*found, strict=True):
+  for bare, beside in zip(*runs, strict=True):
     for key, value in bare.items():
       np.testing.assert_allclose(
           beside[key], value, rtol=1e-3, atol=1e-3, err_msg=key
@@ -228,10 +228,10 @@ def test_a_sink_that_looks_changes_nothing():
       sink = _Curious(env)
       env.add_sink(sink)
     actions = helpers.random_actions(env, 20)
-    found = [helpers.to_bytes(embedded.lucky(env.reset))]
-    found += [helpers.to_bytes(env.step(action)) for action in actions]
+    encoded = [helpers.to_bytes(embedded.lucky(env.reset))]
+    encoded += [helpers.to_bytes(env.step(action)) for action in actions]
     env.close()
     assert not is_watched or sink.num_looks == 21
-    return found
+    return encoded
 
   assert play(is_watched=True) == play(is_watched=False)

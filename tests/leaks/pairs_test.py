@@ -57,24 +57,24 @@ def test_an_agent_cannot_tell_runs_apart_that_differ_in_a_secret(
   secret = secrets.SECRETS[name]
   if secret.needs == 'unread_meter':
     case = case._replace(design=secret.needs)
-  found = pairs.play(case, secret)
-  assert pairs.compare(secret, _expected(case), found) == []
+  transcript = pairs.play(case, secret)
+  assert pairs.compare(secret, _expected(case), transcript) == []
   # The evaluator, on the other hand, does get the difference.
   if secret.is_heard:
-    assert found.true_rewards != _expected(case).true_rewards
+    assert transcript.true_rewards != _expected(case).true_rewards
 
 
 def test_with_meters_another_true_reward_is_visible():
   # The control: these comparisons can tell runs apart.
   case = pairs.Case(design='instantaneous_reward')
-  found = pairs.differences(case, secrets.REWARDS['another sign'])
-  assert [where for where in found if where.startswith('agent')]
+  differences = pairs.differences(case, secrets.REWARDS['another sign'])
+  assert [where for where in differences if where.startswith('agent')]
 
 
 def test_pairs_of_the_campaign_are_counted():
-  counts = leaks_campaign.play_pairs(3, 0, ('reward',))
-  assert counts == leaks_campaign.PairCounts(3, 0, 0)
+  counts = leaks_campaign.play_pairs(2, 0, ('reward',))
+  assert counts == leaks_campaign.PairCounts(2, 0, 0)
 
 
 def test_worlds_that_are_stepped_in_turns_do_not_interact():
-  assert leaks_campaign.interleave(2, 0) == leaks_campaign.Interleaving(0, 0)
+  assert leaks_campaign.interleave(1, 0) == leaks_campaign.Interleaving(0, 0)

@@ -14,11 +14,9 @@ from realab_suite.feedback.providers import demonstration
 from realab_suite.policies import action_sets
 from realab_suite.policies import navigation
 from realab_suite.policies import simple
-from tests.engine import helpers
 
 _CONTROLS = action_sets.DMLAB_LIKE.table(avatars.ACTIONS)
 _TARGETS = {'standard': (1.4, -2.2), 'far': (1.2, -3.6)}
-_STEPS = 40
 _KEY = np.zeros(2, np.uint64)
 
 
@@ -84,16 +82,6 @@ def test_the_seeker_continues_searching_in_a_world_without_a_pad():
   assert env.task.score(env.physics) >= 0.95 * env.task.max_true_return
   where = np.stack([seen['senses/position'] for seen, _ in taken[-60:]])
   assert np.ptp(where, axis=0).max() > 1.0
-
-
-def test_demonstrations_are_the_actions_of_the_seeker():
-  env = _load(design='online_imitation')
-  sink = helpers.RecordingSink()
-  env.add_sink(sink)
-  taken = _run(env, policies.make('apple_seeker'))
-  actions = [action for _, action in taken[:-1]]
-  assert sink.requested('demonstration') == actions
-  assert env.task.score(env.physics) >= 0.95 * env.task.max_true_return
 
 
 @pytest.mark.parametrize(
