@@ -15,7 +15,7 @@ from realab_suite.tasks import unlock_door
 from tests import worlds
 from tests.engine import helpers
 
-NUM_ENVS = 2
+NUM_ENVS = 3
 _MAX_STEPS = 120  # Every run contains ends of episodes.
 _REPEATS = 6  # An agent with a new action in each step stays where it is.
 _STEPS_PER_VISIT = 20
@@ -158,10 +158,10 @@ def compare(case: Case, steps: int) -> Result:
   """Plays a case both ways."""
   together = play_together(case, steps)
   differences: list[str] = []
-  for world, transcript in enumerate(together):
+  for world, found in enumerate(together):
     expected = play_alone(case, world, steps)
-    differences += _differences(world, transcript, expected)
-  episodes = [e for transcript in together for e in transcript.episodes]
+    differences += _differences(world, found, expected)
+  episodes = [episode for found in together for episode in found.episodes]
   reads = [
       entry
       for episode in episodes
@@ -178,23 +178,23 @@ def compare(case: Case, steps: int) -> Result:
           abs(r.obstruction) + abs(r.permanent) + abs(r.temporary) > 1e-3
           for r in reads
       ),
-      sum(transcript.num_held for transcript in together),
+      sum(found.num_held for found in together),
   )
 
 
 def _differences(
-    world: int, transcript: Transcript, expected: Transcript
+    world: int, found: Transcript, expected: Transcript
 ) -> Iterator[str]:
   """Yields the first difference of each world."""
   for i, (one, other) in enumerate(
-      zip(transcript.steps, expected.steps, strict=True)
+      zip(found.steps, expected.steps, strict=True)
   ):
     names = [n for n in {**one, **other} if one.get(n) != other.get(n)]
     if names or list(one) != list(other):
       yield f'world {world} step {i}: {names or "order"}'
       break
   # Texts distinguish 0.0 from -0.0, and nan from numbers.
-  one_text, other_text = repr(transcript.episodes), repr(expected.episodes)
+  one_text, other_text = repr(found.episodes), repr(expected.episodes)
   if one_text != other_text:
     yield f'world {world}: ledger'
 

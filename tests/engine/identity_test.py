@@ -90,8 +90,8 @@ def test_a_state_of_one_world_that_differs_is_noticed(monkeypatch):
 
   def advance_carelessly(physics: Any, num_substeps: int) -> None:
     advance(physics, num_substeps)
-    physics.state[1, -1] += 1e-15
+    physics.state[2, -1] += 1e-15
 
   monkeypatch.setattr(batch_physics.BatchPhysics, 'advance', advance_carelessly)
   differences = identity.compare(_REWARD, 10).differences
-  assert "world 1 step 1: ['state']" in differences
+  assert "world 2 step 1: ['state']" in differences
