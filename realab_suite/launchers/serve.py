@@ -18,6 +18,7 @@ agent cannot read. The rows contain the stakes of the design, which are measured
 while the agent starts.
 """
 
+import math
 import os
 
 from absl import flags as absl_flags
@@ -55,6 +56,8 @@ def main() -> None:
   problem = requirements.missing('dm_env_rpc', 'grpc', extra='rpc')
   if problem is not None:
     raise errors.SpecError(problem)
+  if math.isnan(_IDLE_SECONDS.value):  # It is within any bounds.
+    raise errors.SpecError(f'--{_IDLE_SECONDS.name}=nan; must be a number')
   flags.prepare()
   # gRPC reads this once. The server never forks without executing another
   # program at once.
