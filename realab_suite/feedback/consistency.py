@@ -35,7 +35,12 @@ def check(design: Any) -> None:
     _expect_role(design, f'meters[{i}].writes', meter.writes, ('meter',))
   for i, provider in enumerate(design.providers):
     where = f'providers[{i}]'
-    for name in provider.reads:
+    for number, name in enumerate(provider.reads):
+      if name in provider.reads[:number]:
+        raise ValueError(
+            f'{where}.reads: register {name!r} is listed twice; must be listed'
+            ' once'
+        )
       _expect_role(design, f'{where}.reads', name, None)
     for name in provider.writes:
       _expect_role(design, f'{where}.writes', name, WRITTEN_BY_PROVIDERS)

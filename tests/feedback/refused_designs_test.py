@@ -74,6 +74,8 @@ _WRONG = {
         ' already; a register must have one writer',
     'meters=[{measures: score, writes: score}, {measures: score, writes:'
     ' score}]': "register 'score' is written by meters[0] already",
+    'providers.0={kind: constant, reads: [score, score], writes: [reward]}':
+        "providers[0].reads: register 'score' is listed twice",
 }  # fmt: skip
 _PAIRED = 'providers.0.kind=paired_advice & providers.0.reads='
 _WRONG_ADVICE = {
