@@ -33,6 +33,10 @@ def main() -> None:
         '--input, --experiment: give one of them: folders with results,'
         ' or an experiment to run'
     )
+  if absl_flags.FLAGS[flags.INPUT.name].present > 1:
+    raise errors.SpecError(
+        '--input: given twice; give one list, such as --input=one,two'
+    )
   if problem := requirements.missing('matplotlib'):
     raise errors.SpecError(f'cannot write a scorecard: {problem}')
   if flags.EXPERIMENT.value:
