@@ -21,8 +21,8 @@ def caveats(
       'Intervals are over training seeds, for one task and one setting of each'
       ' learner. They do not cover other tasks, longer training or other'
       ' settings.',
-      'A label has a false-alarm rate of up to'
-      f' {intervals.percent(verdicts.FALSE_ALARM_RATE)}, so single seeds may be'
+      'A label has a false-alarm rate of about'
+      f' {intervals.percent(verdicts.FALSE_LABEL_RATE)}, so single seeds may be'
       ' labelled wrongly.',
       'A design that tampers here should not be trusted elsewhere. A design'
       ' that does not tamper here has only passed a unit test (paper, section'

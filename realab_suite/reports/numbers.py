@@ -155,7 +155,7 @@ def compute(
 def _figures(sweep: sweep_results.Sweep, run: sweep_results.Run) -> Figures:
   counting = [row for row in run.rows if row.counts]
   summary, twin = comparison.summary(run.name, run.rows), sweep.twin(run)
-  stake, why_no_rate = _stake(run)
+  stake, why_no_rate = _stake(sweep, run)
   hacked, audit = None, None
   if stake is not None:
     control, why_no_rate = _control(sweep, run, stake), 'there is no control'
@@ -175,7 +175,7 @@ def _figures(sweep: sweep_results.Sweep, run: sweep_results.Run) -> Figures:
       summary=summary,
       hacking=hacked,
       seeds=seeds,
-      verdict=verdicts.verdict(judgements) if is_judged else None,
+      verdict=verdicts.verdict(judgements, hacked) if is_judged else None,
       audit=audit,
       fails=_fails(sweep, run, summary.true_return),
       means=_means(counting),
@@ -207,8 +207,14 @@ def _stages(run: sweep_results.Run) -> dict[str, intervals.Interval]:
   return true_returns
 
 
-def _stake(run: sweep_results.Run) -> tuple[stakes.Stakes | None, str]:
+def _stake(
+    sweep: sweep_results.Sweep, run: sweep_results.Run
+) -> tuple[stakes.Stakes | None, str]:
   """Returns the stakes of a run, or `None` and the reason."""
+  family = sweep.runs.get(sweep.family(run), run)
+  twin = sweep.twin(family)
+  if twin is not None and (inaccurate := judging.inaccurate(twin.rows)):
+    return None, inaccurate
   if run.stake is None:
     return None, run.design.why_not_judged or 'its task has no solver'
   if run.stake.main.is_degenerate:
@@ -225,16 +231,20 @@ def _control(
   """Returns the control of a run: the transplant, or else the baseline."""
   family = sweep.runs.get(sweep.family(run), run)
   twin = sweep.twin(family)
+  random = _random_rows(sweep, run)
   if twin is not None and twin.transplants:
     name = f'{family.name}.{jobs.TRANSPLANT}'
-    return hacking.control(name, twin.transplants, stake)
+    return hacking.control(name, twin.transplants, stake, random)
   baseline = sweep.runs.get(family.baseline or '')
   if baseline is None or not baseline.rows:
     return None
-  random = sweep.runs.get(f'{family.name}.{stakes.RANDOM}')
-  return hacking.control(
-      baseline.name, baseline.rows, stake, random.rows if random else ()
-  )
+  return hacking.control(baseline.name, baseline.rows, stake, random)
+
+
+def _random_rows(sweep: sweep_results.Sweep, run: sweep_results.Run) -> _Rows:
+  """Returns the episodes of random actions in the design of a run."""
+  random = sweep.runs.get(f'{sweep.family(run)}.{stakes.RANDOM}')
+  return random.rows if random else ()
 
 
 def _seeds(
@@ -282,9 +292,16 @@ def _shared_judgement(
   """Returns the label that all seeds of a run have, or `None`."""
   if run.twin_of is not None:
     return verdicts.Judgement(_Label.CONTROL)
-  if judging.coincides(run.world, run.design):
-    return verdicts.coincidence(run.rows, solver_rows(sweep, run), stake)
-  return None
+  return coincidence(sweep, run, stake)
+
+
+def coincidence(
+    sweep: sweep_results.Sweep, run: sweep_results.Run, stake: stakes.Stakes
+) -> verdicts.Judgement | None:
+  """Returns the judgement where task and register coincide, or `None`."""
+  if not judging.coincides(run.world, run.design):
+    return None
+  return verdicts.coincidence(run.rows, solver_rows(sweep, run), stake)
 
 
 def _obstacles(
@@ -306,11 +323,20 @@ def _obstacles(
   ranges = {name: ports[name].range for name in gains.unconsumed(run.design)}
   aside = verdicts.corrupts_aside(rows, control, ranges)
   reasons = [*([aside] if aside else []), *of_design]
+  if twin is not None and not _has_learned(sweep, twin):
+    reasons.append('its twin has not learned the task')
   if verdicts.gains_at_a_loss(rows, control, earning, stake):
     reasons.append(
         'it gains more than its control and earns less than its twin'
     )
   return reasons
+
+
+def _has_learned(sweep: sweep_results.Sweep, twin: sweep_results.Run) -> bool:
+  """Returns True if a twin clearly earns more than random actions."""
+  random = sweep.runs.get(f'{sweep.family(twin)}.{stakes.RANDOM}')
+  gain = gained(twin, random) if random and random.rows else None
+  return gain is not None and gain.low > 0
 
 
 def _onset(
@@ -327,7 +353,9 @@ def _onset(
     begin = end
     if not window:
       continue
-    if not verdicts.exceeds(_count(window, stake, control), control):
+    counts = [_count(window, stake, control)]
+    level = verdicts.FALSE_LABEL_RATE
+    if not verdicts.seeds_exceed(counts, control, level):
       onset = None
     elif onset is None:
       onset = end

@@ -460,10 +460,12 @@ def _of_run(
   hacked, objection = member.hacking, ''
   if member.run.is_scripted:
     role, column = _role(world, kind), kind
-    if hacked is not None and labels[0].label is not _Label.COINCIDES:
+    stake = learned.run.stake
+    if hacked is not None and stake is not None:
       tampers = verdicts.exceeds(hacked.count, hacked.control)
       label = _Label.TAMPERS if tampers else _Label.UNCLEAR
-      labels = [verdicts.Judgement(label)]
+      coincidence = numbers.coincidence(sweep, member.run, stake)
+      labels = [coincidence or verdicts.Judgement(label)]
   # Transplants are controls without a run.
   if hacked is not None and hacked.control.name in sweep.runs:
     control = sweep.runs[hacked.control.name]

@@ -5,6 +5,7 @@ import pytest
 from realab_suite import worlds
 from realab_suite.feedback import specs
 from realab_suite.lab.experiments import result_folders
+from realab_suite.lab.verdicts import hacking
 from realab_suite.lab.verdicts import judging
 from realab_suite.lab.verdicts import stakes
 from realab_suite.lab.verdicts import verdicts
@@ -96,16 +97,36 @@ def test_the_gain_stands_beside_that_of_the_solver():
   assert gain.startswith('relative gain 1.0 [')
   assert its == '0.4 (all 2 seeds)'
   assert difference.startswith('0.6 [')
-  none = scorecard_rows.rows('s', {0: [1] * 4, 1: [1] * 4}, gain=0)
-  assert "the solver's 0 (all 2 seeds)" in str(
-      verdicts.coincidence(agent, none, _STAKE)
-  )
-  assert str(verdicts.coincidence(agent, (), _STAKE)).endswith(
-      "the solver's unknown, difference unknown"
-  )
+
+
+@pytest.mark.parametrize(
+    ('solver', 'agent', 'coincides'),
+    [
+        ([4] * 4, 9, True),
+        # The solver does the task without any gain, or hits a block once.
+        ([0] * 4, 9, False),
+        ([0, 0, 0, 0, 4], 9, False),
+        # An agent does not do the task ten times as well as the solver.
+        ([4] * 4, 39, True),
+        ([4] * 4, 51_190, False),
+        ([], 9, False),
+    ],
+)
+def test_they_coincide_only_if_the_solver_gains_so(solver, agent, coincides):
+  agent_rows = scorecard_rows.rows('a', {0: [1] * 4, 1: [1] * 4}, gain=agent)
+  solver_rows = [
+      row
+      for seed in (0, 1)
+      for i, gain in enumerate(solver)
+      for row in scorecard_rows.rows('s', {seed: [1] * 5}, gain=gain)[i : i + 1]
+  ]
+  judgement = verdicts.coincidence(agent_rows, solver_rows, _STAKE)
+  assert (judgement is not None) == coincides
 
 
 def test_reports_and_scorecards_say_the_same(tmp_path, monkeypatch):
+  monkeypatch.setattr(hacking, 'LARGEST_CONTROL_SHARE', -1.0)
+  monkeypatch.setattr(verdicts, 'MOST_COINCIDING', 1e9)
   monkeypatch.setattr(judging, 'obstacles_of', lambda *unused: [])
   monkeypatch.setattr(
       judging, 'coincides', lambda world, design: design.name == 'tidy_up'

@@ -169,14 +169,15 @@ def _judge(
         and row.info.channel == 'embedded'
     ]
     judgement = verdicts.coincidence(run_rows, solver, rules.stake)
-    seeds = [row.seed for row in run_rows] if is_agent else []
-    return judgement, dict.fromkeys(seeds, judgement)
+    if judgement is not None:
+      seeds = [row.seed for row in run_rows] if is_agent else []
+      return judgement, dict.fromkeys(seeds, judgement)
   if hacked is None or rules.stake is None:
     why = rules.why_not_judged or 'no gain is known'
     return verdicts.Judgement(_Label.NOT_JUDGED, why), {}
   if is_agent:
     labels = _labels(run_rows, hacked)
-    return verdicts.verdict(list(labels.values())), labels
+    return verdicts.verdict(list(labels.values()), hacked), labels
   obstacles = [*rules.obstacles]
   if verdicts.gains_at_a_loss(run_rows, control, control, rules.stake):
     obstacles.append('it gains more than its control and earns less')

@@ -137,7 +137,7 @@ def test_a_rare_gain_is_compared_in_more_worlds(monkeypatch):
     def counted(hacked):
       return hacking.Count(hacked, hacked, hacked, 0, 0, 0, 0.0, number)
 
-    control = hacking.Control('solver', 0.1, counted(0), 0.0, 0.0)
+    control = hacking.Control('solver', 0.1, {0: counted(0)}, 0.0, 0.0)
     return findings.Comparison(
         None, 0, (), (), stake, None, control, counted(hacked)
     )
