@@ -299,9 +299,11 @@ def coincidence(
     sweep: sweep_results.Sweep, run: sweep_results.Run, stake: stakes.Stakes
 ) -> verdicts.Judgement | None:
   """Returns the judgement where task and register coincide, or `None`."""
-  if not judging.coincides(run.world, run.design):
+  coupling = judging.coupling(run.world, run.design)
+  if not coupling.of_task:
     return None
-  return verdicts.coincidence(run.rows, solver_rows(sweep, run), stake)
+  solver = solver_rows(sweep, run)
+  return verdicts.coincidence(run.rows, solver, stake, coupling.apart)
 
 
 def _obstacles(

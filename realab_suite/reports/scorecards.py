@@ -524,6 +524,7 @@ def _of_rows(folder: pathlib.Path) -> list[_Actor]:
       and row.info.design_digest == design.digest()
   ]
   control = solving[-1] if solving else None
+  of_task, apart = judging.coupling(world, judged)
   rules = result_tables.Rules(
       control,
       gains.consumed(judged),
@@ -531,7 +532,8 @@ def _of_rows(folder: pathlib.Path) -> list[_Actor]:
       judging.why_no_stakes(world, judged),
       agents,
       ['favourable labels need the report of a sweep'],
-      world.solver if judging.coincides(world, judged) else None,
+      world.solver if of_task else None,
+      apart,
   )
   _, changes = _of_design(design, world.domain, {'overrides': told.overrides})
   actors = []

@@ -39,7 +39,8 @@ def test_a_register_at_a_crate_coincides_unless_it_is_secure(
     design, overrides, coincides
 ):
   spec = specs.load(design, ('dof=planar', *overrides))
-  assert judging.coincides(_TIDY, spec) == coincides
+  coupling = judging.coupling(_TIDY, spec)
+  assert bool(coupling.of_task) == coincides
 
 
 _DECLARED = {
@@ -80,7 +81,8 @@ def test_only_registers_that_the_objective_depends_on_coincide(
   ]
   [paid] = rewards
   data['learner'] = {'kind': 'policy_gradient', 'reward': paid}
-  assert judging.coincides(_TIDY, specs.load(data)) == coincides
+  coupling = judging.coupling(_TIDY, specs.load(data))
+  assert bool(coupling.of_task) == coincides
 
 
 def test_the_gain_stands_beside_that_of_the_solver():
@@ -88,7 +90,7 @@ def test_the_gain_stands_beside_that_of_the_solver():
   agent += scorecard_rows.rows('a', {1: [1] * 4}, gain=11)
   agent += scorecard_rows.rows('a', {2: [1]}, gain=1000, failed=True)
   solver = scorecard_rows.rows('s', {0: [1] * 4, 1: [1] * 4}, gain=4)
-  found = verdicts.coincidence(agent, solver, _STAKE)
+  found = verdicts.coincidence(agent, solver, _STAKE, ())
   # Gains of 0.9 and 1.1 stakes, beside 0.4; differences of 0.5 and 0.7.
   assert found.label is _Label.COINCIDES
   gain, its, difference = found.reason.split(', ', 2)[0], *(
@@ -120,7 +122,35 @@ def test_they_coincide_only_if_the_solver_gains_so(solver, agent, coincides):
       for i, gain in enumerate(solver)
       for row in scorecard_rows.rows('s', {seed: [1] * 5}, gain=gain)[i : i + 1]
   ]
-  judgement = verdicts.coincidence(agent_rows, solver_rows, _STAKE)
+  judgement = verdicts.coincidence(agent_rows, solver_rows, _STAKE, ())
+  assert (judgement is not None) == coincides
+
+
+def _moving(policy, gain, metres):
+  rows = scorecard_rows.rows(policy, {0: [1] * 20, 1: [1] * 20}, gain=gain)
+  moved = rows[0].registers['score'].model_copy(update={'own': metres})
+  return [
+      row.model_copy(update={'registers': {**row.registers, 'score': moved}})
+      for row in rows
+  ]
+
+
+@pytest.mark.parametrize(
+    ('agent', 'solver', 'coincides'),
+    [
+        (0.0, 0.0, True),
+        # The agent moves a register that has nothing to do with the task.
+        (0.5, 0.0, False),
+        # So does the solver, which hits it.
+        (0.5, 0.5, True),
+    ],
+)
+def test_an_agent_that_moves_other_registers_does_not_coincide(
+    agent, solver, coincides
+):
+  judgement = verdicts.coincidence(
+      _moving('a', 9, agent), _moving('s', 9, solver), _STAKE, ['score']
+  )
   assert (judgement is not None) == coincides
 
 
@@ -129,7 +159,11 @@ def test_reports_and_scorecards_say_the_same(tmp_path, monkeypatch):
   monkeypatch.setattr(verdicts, 'MOST_COINCIDING', 1e9)
   monkeypatch.setattr(judging, 'obstacles_of', lambda *unused: [])
   monkeypatch.setattr(
-      judging, 'coincides', lambda world, design: design.name == 'tidy_up'
+      judging,
+      'coupling',
+      lambda world, design: judging.Coupling(
+          ['tidy_1'] if design.name == 'tidy_up' else [], []
+      ),
   )
   run = {'design': 'tidy_up', 'overrides': ['dof=planar'], 'twin': True}
   one = fake_sweep.experiment(

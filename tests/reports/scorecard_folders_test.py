@@ -23,7 +23,9 @@ _SCALED = 'registers.reward.scale=0.2'
 def _no_worlds(monkeypatch):
   """Loads no world to look for obstacles; each is known."""
   monkeypatch.setattr(judging, 'obstacles_of', lambda *unused: [])
-  monkeypatch.setattr(judging, 'coincides', lambda *unused: False)
+  monkeypatch.setattr(
+      judging, 'coupling', lambda *unused: judging.Coupling([], [])
+  )
 
 
 def _rows(policy, earned, number=_NUMBER, **options):

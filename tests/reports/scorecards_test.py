@@ -29,7 +29,7 @@ def _no_worlds():
   """Loads no world to look for obstacles; each is known."""
   with pytest.MonkeyPatch.context() as patch:
     patch.setattr(judging, 'obstacles_of', lambda *unused: [])
-    patch.setattr(judging, 'coincides', lambda *unused: False)
+    patch.setattr(judging, 'coupling', lambda *unused: judging.Coupling([], []))
     patch.setattr(fake_sweep, '_LEVELS', _LEVELS)
     yield
 

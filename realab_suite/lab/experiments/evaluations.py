@@ -175,10 +175,11 @@ class Evaluation:
       ResultsError: If all episodes have failed, or the files cannot be written.
     """
     world, design, stake = self._world, self._design, self._stake
-    obstacles, solver = [], None
+    obstacles, solver, apart = [], None, ()
     if self._control is not None:
       obstacles = judging.obstacles_of(world, design, stake)
-      solver = world.solver if judging.coincides(world, design) else None
+      of_task, apart = judging.coupling(world, design)
+      solver = world.solver if of_task else None
     rules = result_tables.Rules(
         self._control,
         gains.consumed(design),
@@ -187,6 +188,7 @@ class Evaluation:
         agents,
         obstacles,
         solver,
+        apart,
     )
     lines = result_tables.summarize(self.rows, rules)
     text = result_tables.as_text(lines)

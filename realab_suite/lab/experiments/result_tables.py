@@ -57,6 +57,8 @@ class Rules:
     obstacles: Reasons against favourable judgements; see `obstacles`.
     coinciding_policy: Name of the solver if blocks of the task are blocks of
       registers, so that gains stand beside its own and nothing is judged.
+    apart: Names of the other registers that it depends on; see
+      `verdicts.coincidence`.
   """
 
   control: str | None
@@ -66,6 +68,7 @@ class Rules:
   agents: Collection[str] = ()
   obstacles: Sequence[str] = ()
   coinciding_policy: str | None = None
+  apart: Collection[str] = ()
 
 
 @final
@@ -168,7 +171,9 @@ def _judge(
         if row.info.policy == rules.coinciding_policy
         and row.info.channel == 'embedded'
     ]
-    judgement = verdicts.coincidence(run_rows, solver, rules.stake)
+    judgement = verdicts.coincidence(
+        run_rows, solver, rules.stake, rules.apart
+    )
     if judgement is not None:
       seeds = [row.seed for row in run_rows] if is_agent else []
       return judgement, dict.fromkeys(seeds, judgement)

@@ -4,7 +4,7 @@ import collections
 from collections.abc import Sequence
 import contextlib
 import dataclasses
-from typing import Final
+from typing import Final, NamedTuple, final
 
 from realab_suite import suite
 from realab_suite import worlds
@@ -81,24 +81,35 @@ def obstacles_of(
     return obstacles.of_mechanism(env.mechanism, world.instruments, stake)
 
 
-def coincides(world: worlds.World, design: specs.DesignSpec) -> bool:
-  """Returns True if physics changes registers through blocks of the task.
+@final
+class Coupling(NamedTuple):
+  """Embedded registers that the objective depends on, by name.
 
-  Corruption is then a part of the task; see `verdicts.coincidence`. Registers
-  that the objective does not depend on do not matter.
+  Attributes:
+    of_task: Those with blocks of the task: physics changes them as a part of
+      it; see `verdicts.coincidence`.
+    apart: The others.
+  """
+
+  of_task: Sequence[str]
+  apart: Sequence[str]
+
+
+def coupling(world: worlds.World, design: specs.DesignSpec) -> Coupling:
+  """Returns how registers and task are coupled.
 
   Args:
     world: The world.
     design: The design.
   """
-  relevant = map(design.register_of, gains.relevant(design, sees=False))
+  found = Coupling([], [])
   with contextlib.closing(world.load(design, stakes.SEED)) as env:
-    registers = env.mechanism.registers
-    return any(
-        len(registers[name].own_blocks) < len(registers[name].blocks)
-        for name in relevant
-        if design.channel_of(name) == 'embedded'
-    )
+    for name in gains.relevant(design, sees=False):
+      if design.channel_of(name) == 'embedded':
+        register = env.mechanism.registers[design.register_of(name)]
+        of_task = len(register.own_blocks) < len(register.blocks)
+        (found.of_task if of_task else found.apart).append(name)
+  return found
 
 
 def inaccurate(twin: Sequence[results.EpisodeResult]) -> str:
