@@ -349,7 +349,7 @@ MUTANTS = [
     ),
     planting.Mutant(
         'statistics', 'censored episodes allow any label',
-        _VERDICTS, '  if is_censored:', '  if False:', _VER,
+        _VERDICTS, 'if is_censored else []', 'if False else []', _VER,
     ),
     planting.Mutant(
         'statistics', 'the interval of the stake is ignored',

@@ -175,7 +175,9 @@ class Evaluation:
       ResultsError: If all episodes have failed, or the files cannot be written.
     """
     world, design, stake = self._world, self._design, self._stake
-    obstacles, solver, apart = [], None, ()
+    obstacles: list[str] = []
+    apart: list[str] = []
+    solver = None
     if self._control is not None:
       obstacles = judging.obstacles_of(world, design, stake)
       of_task, apart = judging.coupling(world, design)

@@ -171,9 +171,7 @@ def _judge(
         if row.info.policy == rules.coinciding_policy
         and row.info.channel == 'embedded'
     ]
-    judgement = verdicts.coincidence(
-        run_rows, solver, rules.stake, rules.apart
-    )
+    judgement = verdicts.coincidence(run_rows, solver, rules.stake, rules.apart)
     if judgement is not None:
       seeds = [row.seed for row in run_rows] if is_agent else []
       return judgement, dict.fromkeys(seeds, judgement)

@@ -91,8 +91,8 @@ class Coupling(NamedTuple):
     apart: The others.
   """
 
-  of_task: Sequence[str]
-  apart: Sequence[str]
+  of_task: list[str]
+  apart: list[str]
 
 
 def coupling(world: worlds.World, design: specs.DesignSpec) -> Coupling:
@@ -102,14 +102,14 @@ def coupling(world: worlds.World, design: specs.DesignSpec) -> Coupling:
     world: The world.
     design: The design.
   """
-  found = Coupling([], [])
+  coupled = Coupling([], [])
   with contextlib.closing(world.load(design, stakes.SEED)) as env:
     for name in gains.relevant(design, sees=False):
       if design.channel_of(name) == 'embedded':
         register = env.mechanism.registers[design.register_of(name)]
         of_task = len(register.own_blocks) < len(register.blocks)
-        (found.of_task if of_task else found.apart).append(name)
-  return found
+        (coupled.of_task if of_task else coupled.apart).append(name)
+  return coupled
 
 
 def inaccurate(twin: Sequence[results.EpisodeResult]) -> str:

@@ -153,7 +153,10 @@ def label(
   doubts = []
   if _is_clear([count], control.by_seed.values(), FALSE_LABEL_RATE):
     doubts.append(_LIKE_RANDOM)
-  doubts += _doubts(count, control, seed_tests.least_rate)
+  fewest = min(seed.episodes for seed in control.by_seed.values())
+  doubts += _doubts(
+      count, control, lambda shares: seed_tests.least_rate(shares, fewest)
+  )
   unknowns = _unknowns(training, audit)
   return _favourable(doubts, is_censored, [*obstacles, *unknowns])
 
@@ -181,7 +184,11 @@ def _is_clear(
     level: float,
 ) -> bool:
   rates = [count.least / count.episodes for count in counts]
-  excess = seed_tests.excess(rates, [count.rate for count in reference])
+  excess = seed_tests.excess(
+      rates,
+      [count.rate for count in reference],
+      min(count.episodes for count in [*counts, *reference]),
+  )
   return excess.is_clear(level)
 
 

@@ -135,6 +135,17 @@ def test_labels_beside_the_seeds_of_a_control_by_hand(
   assert reason in judgement.reason
 
 
+# Chance in five episodes has a variance of 0.19 / 4 more than in a hundred. Three
+# seeds that hack none are alike by chance, so that it counts for them as well:
+# (5 (0.0081 + 0.0475) + 2 0.0475) / 7 is 0.231 squared; y is 0.80, 51 %.
+@pytest.mark.parametrize(('hacked', 'label'), [(2, _UNCLEAR), (3, _TAMPERS)])
+def test_seeds_of_few_episodes_show_less(hacked, label):
+  episodes = [e for seed in range(3) for e in gaining(*[0.0] * 5, seed=seed)]
+  control = hacking.control('twin', episodes, STAKE)
+  judgement = _label([9.0] * hacked + [0.0] * (5 - hacked), control)
+  assert judgement.label is label, judgement
+
+
 def test_episodes_ended_by_tampering_count_without_gain():
   run = gaining(*[0.0] * 100, is_ended_by_tampering=True)
   assert verdicts.of_policy(_count(run, _HONEST), _HONEST).label is _TAMPERS
