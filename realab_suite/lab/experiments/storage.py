@@ -79,7 +79,7 @@ def locked(folder: pathlib.Path) -> Iterator[None]:
   with contextlib.ExitStack() as stack:
     with explained(path):
       folder.mkdir(parents=True, exist_ok=True)
-      descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+      descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
       stack.callback(os.close, descriptor)
       try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -2,6 +2,7 @@
 
 import errno
 import json
+import os
 import pathlib
 
 import pytest
@@ -96,3 +97,15 @@ def test_a_folder_with_results_is_never_used_again(tmp_path):
   (tmp_path / 'new' / 'row').touch()
   with pytest.raises(errors.ResultsError, match='never overwritten; name anot'):
     storage.new_folder(str(tmp_path / 'new'))
+
+
+@pytest.mark.parametrize(
+    ('umask', 'mode'), [(0o002, 0o664), (0o022, 0o644), (0o077, 0o600)]
+)
+def test_a_group_that_shares_its_files_shares_locks(tmp_path, umask, mode):
+  before = os.umask(umask)
+  try:
+    with storage.locked(tmp_path / 'new'):
+      assert (tmp_path / 'new' / 'lock').stat().st_mode & 0o777 == mode
+  finally:
+    os.umask(before)
