@@ -2,7 +2,10 @@
 
 from collections.abc import Callable, Sequence
 import functools
+import io
+import os
 import sys
+from typing import Any, final
 
 from absl import app
 from absl import flags
@@ -13,6 +16,29 @@ from realab_suite import errors
 
 USAGE_ERROR = 2
 _INTERRUPTED = 130
+
+
+@final
+class _Output(io.FileIO):
+  """A standard stream, silent after the end of its reader, such as `head`."""
+
+  def write(self, data: Any) -> int:
+    try:
+      return super().write(data)
+    except BrokenPipeError:
+      return memoryview(data).nbytes
+
+
+def outlive_readers() -> None:
+  """Lets the program continue if its standard streams have no reader."""
+  for name in ('stdout', 'stderr'):
+    stream = getattr(sys, name)
+    if stream is None:  # The shell has closed it.
+      setattr(sys, name, open(os.devnull, 'w', encoding='utf-8'))
+      continue
+    raw = io.BufferedWriter(_Output(stream.fileno(), 'w', closefd=False))
+    form = stream.encoding, stream.errors
+    setattr(sys, name, io.TextIOWrapper(raw, *form, line_buffering=True))
 
 
 def say(line: str) -> None:
@@ -26,6 +52,7 @@ def start(main: Callable[[], int | None]) -> None:
   Args:
     main: Main function, which may return an exit status other than 0.
   """
+  outlive_readers()
   app.run(functools.partial(_in_one_line, main), flags_parser=_parse)
 
 

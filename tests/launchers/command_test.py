@@ -48,6 +48,38 @@ def _run(*arguments, module='realab_suite.launchers.compare', **environment):
   )
 
 
+_SAYS = """
+import sys
+from realab_suite.launchers import program
+
+def main():
+  for i in range(3):
+    program.say(f'line {i}')
+    sys.stderr.write('more\\n')
+  return 7
+
+program.start(main)
+"""
+
+
+@pytest.mark.parametrize('ends', ['', '2>&1', '>&-', '2>&1 >&-', '>&- 2>&-'])
+def test_programs_outlive_the_readers_of_their_output(ends):
+  read, write = os.pipe()
+  os.close(read)
+  ran = subprocess.run(
+      ['sh', '-c', f'exec {sys.executable} -c "$0" {ends}', _SAYS],
+      stdout=write,
+      stderr=subprocess.PIPE,
+      timeout=patience.SECONDS,
+      check=False,
+  )
+  os.close(write)
+  assert (ran.returncode, ran.stderr) == (
+      7,
+      b'' if '2>' in ends else b'more\n' * 3,
+  )
+
+
 def _seeds(text):
   with flagsaver.flagsaver(seeds=text):
     return flags.seeds()
