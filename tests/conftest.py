@@ -17,6 +17,7 @@ import sys
 
 # Before anything imports dm_control.
 os.environ.setdefault('MUJOCO_GL', 'disable')
+os.environ['no_proxy'] = 'localhost,127.0.0.1'
 
 import hypothesis
 import pytest

@@ -43,7 +43,7 @@ def prepare(address: str) -> grpc.LocalConnectionType:
   if len(os.fsencode(path)) > _MAX_PATH or not path.is_absolute():
     raise errors.SpecError(
         f'address: {address!r:.80}; must be an absolute path of at most'
-        f' {_MAX_PATH} bytes'
+        f' {_MAX_PATH} bytes; without --address, set a shorter TMPDIR'
     )
   try:
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)

@@ -42,6 +42,12 @@ def test_a_wrong_address_is_refused(address):
     agent_server.Server(_Nothing(), address).start()
 
 
+def test_a_long_temporary_folder_is_named():
+  folder = f'/{"x" * 120}/realab-1'
+  with pytest.raises(errors.SpecError, match='set a shorter TMPDIR'):
+    agent_server.Server(_Nothing(), f'unix:{folder}/socket').start()
+
+
 def test_an_address_in_use_is_refused(serving):
   with pytest.raises(errors.SpecError, match='is in use'):
     agent_server.Server(_Nothing(), serving.address).start()
