@@ -107,6 +107,7 @@ class BatchEnvironment:
   @property
   def physics(self) -> batch_physics.BatchPhysics:
     """Physics of all worlds, for evaluators; agents do not get it."""
+    self._refuse_if_closed()
     return self._physics
 
   @property
@@ -145,21 +146,25 @@ class BatchEnvironment:
     """Undoes `add_sink`."""
     self._sinks.remove(sink)
 
-  def rewind(self, random: int | Sequence[int] | None = None) -> None:
+  def rewind(self, random: int | Sequence[int | None] | None = None) -> None:
     """Abandons the current episodes; the next one of every world is the first.
 
     Args:
       random: New seed of all worlds, or a seed for each world; `None` for the
-        present seeds.
+        present seeds. In a sequence, the next episode of a world with `None` is
+        the one after its current episode.
 
     Raises:
       SpecError: If a seed is invalid.
     """
     self._refuse_if_closed()
+    seeds = self._seeds
     if random is not None:
-      self._seeds = seeding.seeds(random, self._num_envs)
+      seeds = seeding.seeds(random, self._num_envs)
+    is_first = np.array([seed is not None for seed in seeds])
     self._notify_of_ends(~self._is_pending, events.End.ABANDONED)
-    self._episodes = np.full(self._num_envs, -1)
+    self._seeds = np.where(is_first, seeds, self._seeds)
+    self._episodes = np.where(is_first, -1, self._episodes)
     self._is_pending = np.ones(self._num_envs, bool)
 
   def action_spec(self) -> specs.Array:
@@ -368,6 +373,7 @@ class BatchEnvironment:
       SpecError: If an index is invalid, a source has not begun an episode,
         blocks of this batch can sleep, or a sink cannot be saved.
     """
+    self._refuse_if_closed()
     snapshots.refuse_sleep(self._physics.model)
     indices = arguments.indices(worlds, self._num_envs)
     rows = arguments.sources(sources, len(indices), self._episodes >= 0)
@@ -424,8 +430,9 @@ class BatchEnvironment:
       The frames, `(worlds, height, width, 3)` uint8.
 
     Raises:
-      SpecError: If there is no such world or camera.
-      RenderingError: If no renderer is available, or if it fails at this size.
+      SpecError: If there is no such world or camera, or the model has no room
+        for the size.
+      RenderingError: If no renderer is available, or if it fails.
     """
     self._refuse_if_closed()
     arguments.camera(camera, self._task.root_entity.mjcf_model)

@@ -17,7 +17,6 @@ import mujoco
 from mujoco import batch as mujoco_batch
 import numpy as np
 
-from realab_suite import errors
 from realab_suite.engine import single_physics
 from realab_suite.entities import cameras
 from realab_suite.entities import protocols
@@ -231,20 +230,15 @@ class BatchPhysics:
       The frames, `(worlds, height, width, 3)` uint8.
 
     Raises:
-      RenderingError: If no renderer is available, or if it fails at this size.
+      RenderingError: If no renderer is available, or if it fails.
+      SpecError: If the model has no room for the size.
     """
-    try:
-      return np.stack(
-          [
-              self._template_in(w).render(height, width, camera_id=camera)
-              for w in worlds
-          ]
-      )
-    except (RuntimeError, ValueError) as error:  # All that dm_control raises.
-      raise errors.RenderingError(
-          f'{camera}: no frame of {height} x {width} pixels'
-          f' ({str(error).strip().splitlines()[0]})'
-      ) from error
+    from realab_suite.engine import gl_contexts  # As in `single_physics`.
+
+    templates = map(self._template_in, worlds)
+    return np.stack(
+        [gl_contexts.frame(t, camera, height, width) for t in templates]
+    )
 
   def _template_in(self, world: int) -> single_physics.ThinPhysics:
     """Returns the template, which can render, in the state of a world."""

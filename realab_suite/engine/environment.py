@@ -108,6 +108,7 @@ class Environment(composer.Environment):
     Raises:
       SpecError: If something is in the way of a register.
     """
+    self._refuse_if_closed()
     self._host.check_placement(
         self._physics, self._mechanism, self._start_check
     )
@@ -165,6 +166,7 @@ class Environment(composer.Environment):
   @property
   def physics(self) -> Any:
     """Physics of the world, in which poses are up to date."""
+    self._refuse_if_closed()
     if isinstance(self._physics, single_physics.ThinPhysics):
       self._physics.update_poses()
     return super().physics
@@ -176,6 +178,7 @@ class Environment(composer.Environment):
     Raises:
       SpecError: If the task is a foreign task.
     """
+    self._refuse_if_closed()
     if not isinstance(self._physics, single_physics.ThinPhysics):
       raise errors.SpecError(
           f'{type(self._task).__name__} is not a task of this package'

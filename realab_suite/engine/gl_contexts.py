@@ -13,9 +13,11 @@ from typing import Any
 from dm_control import _render
 from dm_control.mujoco import engine
 from dm_control.mujoco import wrapper
+import numpy as np
 
 from realab_suite import _display
 from realab_suite import errors
+from realab_suite.config import integers
 
 
 def make(max_width: int, max_height: int) -> Any:
@@ -53,6 +55,38 @@ def for_pictures(model: wrapper.MjModel) -> engine.Contexts:
     raise errors.RenderingError(
         f'physics: no picture with {what_to_set(error)}'
     ) from error
+
+
+def check_size(model: wrapper.MjModel, height: int, width: int) -> None:
+  """Checks the height and the width of a frame for people, in pixels.
+
+  Raises:
+    SpecError: If the offscreen buffer of the model has no room for the frame.
+  """
+  buffer = model.vis.global_
+  more = ', the offscreen buffer of the model'
+  integers.check('height', height, 1, buffer.offheight, more=more)
+  integers.check('width', width, 1, buffer.offwidth, more=more)
+
+
+def frame(
+    physics: engine.Physics, camera: str | int, height: int, width: int
+) -> np.ndarray:
+  """Renders a frame of one world for people, `(height, width, 3)` uint8.
+
+  Raises:
+    RenderingError: If no renderer is available, or if it fails.
+    SpecError: As in `check_size`.
+  """
+  check_size(physics.model, height, width)
+  try:
+    picture: np.ndarray = physics.render(height, width, camera_id=camera)
+  except (RuntimeError, ValueError) as error:  # All that dm_control raises.
+    raise errors.RenderingError(
+        f'{camera}: no frame of {height} x {width} pixels'
+        f' ({str(error).strip().splitlines()[0]})'
+    ) from error
+  return picture
 
 
 def what_to_set(error: Exception) -> str:

@@ -43,16 +43,18 @@ def as_seed(random: Any) -> int:
 
 
 def seeds(random: Any, num_envs: int) -> np.ndarray:
-  """Returns the seed of each world, `(worlds,)`, objects.
+  """Returns the seed of each world or `None`, `(worlds,)`, objects.
 
   Args:
-    random: Seed of all worlds, as in `as_seed`, or a sequence with the seed of
-      each world.
+    random: Seed of all worlds, as in `as_seed`, or a sequence or array with the
+      seed of each world, or `None` for a world without a new one.
     num_envs: Number of worlds.
 
   Raises:
     SpecError: If a seed is invalid, or their number is wrong.
   """
+  if isinstance(random, np.ndarray) and random.ndim:
+    random = random.tolist()
   if not isinstance(random, Sequence):
     random = [as_seed(random)] * num_envs
   if len(random) != num_envs:
@@ -61,7 +63,9 @@ def seeds(random: Any, num_envs: int) -> np.ndarray:
         ' seeds, one for each world'
     )
   # Objects keep large seeds.
-  return np.array([as_seed(one) for one in random], object)
+  return np.array(
+      [one if one is None else as_seed(one) for one in random], object
+  )
 
 
 def sequence(

@@ -96,12 +96,17 @@ def test_physics_that_fail_in_one_world_leave_the_others_alone(batch):
 
 def test_a_closed_batch_does_nothing():
   batch = _load()
+  batch.reset()
   batch.close()
   batch.close()
-  with pytest.raises(errors.ClosedError):
-    batch.reset()
-  with pytest.raises(errors.ClosedError):
-    batch.step(np.zeros((_NUM_ENVS, 6)))
+  for use in (
+      batch.reset,
+      lambda: batch.step(np.zeros((_NUM_ENVS, 6))),
+      lambda: batch.physics,
+      lambda: batch.branch([0], [1]),
+  ):
+    with pytest.raises(errors.ClosedError):
+      use()
 
 
 class _Overflowing(collect_apples.CollectApples):

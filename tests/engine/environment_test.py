@@ -136,6 +136,9 @@ def test_closing_twice_does_nothing_and_a_closed_environment_does_nothing():
       lambda: env.step(action),
       lambda: env.step(None),
       env.rewind,
+      env.check_placement,
+      lambda: env.physics,
+      lambda: env.thin_physics,
       lambda: env.add_sink(helpers.RecordingSink()),
   ):
     with pytest.raises(errors.ClosedError):

@@ -39,6 +39,7 @@ def evaluate(
 
   Raises:
     ResultsError: If `env` is another environment, or a number is invalid.
+    SpecError: If a wrapper resets with a seed.
   """
   environment = single.environment_of(env)
 
@@ -50,6 +51,7 @@ def evaluate(
       is_over = bool(terminated or truncated)
     environment.abandon()  # If a wrapper has ended the episode.
 
-  return evaluation.results_of(
-      environment, play, num_episodes, objective=objective
-  )
+  with single.keeping_seed(env):
+    return evaluation.results_of(
+        environment, play, num_episodes, objective=objective
+    )

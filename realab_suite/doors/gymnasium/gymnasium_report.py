@@ -94,6 +94,7 @@ def write(
   num_seeds = _num_seeds(agents)
   settings = _settings(name, options)
   with _opened(name, settings, first_seed, wrap) as env:
+    env.reset()  # Refuses wrappers with a seed.
     loaded = single.environment_of(env)
     world, design = _world_of(loaded, settings), loaded.mechanism.design
     baseline_names = _baselines(baselines, world.solver, agents)
@@ -166,7 +167,7 @@ def _opened(
   """Loads a world with a seed, wrapped for agents, and closes it."""
   task_kwargs = {**(settings.get('task_kwargs') or {}), 'random': seed}
   env = gym.make(name, **{**settings, 'task_kwargs': task_kwargs})
-  with contextlib.closing(env):
+  with contextlib.closing(env), single.keeping_seed(env):
     yield wrap(env)
 
 

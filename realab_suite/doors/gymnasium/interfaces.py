@@ -3,12 +3,13 @@
 from collections.abc import Collection, Mapping
 from typing import Any, Literal, final
 
-from dm_control import composer
-
 from realab_suite import errors
 from realab_suite.config import validation
 from realab_suite.doors.gymnasium import codecs
 from realab_suite.engine import agent_view
+from realab_suite.engine import batch_environment
+from realab_suite.engine import environment
+from realab_suite.engine import gl_contexts
 
 _CAMERA = 'top_down'
 # Height and width of a frame, in pixels.
@@ -35,13 +36,13 @@ class Options(validation.Model):
 
 
 def check_names(given: Collection[str], allowed: Collection[str]) -> None:
-  """Checks the names of keyword arguments.
+  """Checks the names of keyword arguments, or of options of a reset.
 
   The message has the words of Python, for which TorchRL looks when it tries out
   keyword arguments.
 
   Args:
-    given: Names of the keyword arguments.
+    given: Names to check.
     allowed: Allowed names.
 
   Raises:
@@ -69,14 +70,14 @@ class Interface:
   def __init__(
       self,
       view: agent_view.AgentView | agent_view.BatchAgentView,
-      task: composer.Task,
+      env: environment.Environment | batch_environment.BatchEnvironment,
       options: Mapping[str, Any],
   ) -> None:
     """Makes an interface.
 
     Args:
       view: View of the world or of the batch.
-      task: Its task.
+      env: The world or the batch.
       options: Values of `Options`.
 
     Raises:
@@ -89,9 +90,11 @@ class Interface:
     self.actions = codecs.ActionCodec(view.action_spec())
     self.metadata = {
         'render_modes': ['rgb_array'],
-        'render_fps': 1.0 / task.control_timestep,
+        'render_fps': 1.0 / env.task.control_timestep,
     }
     self.render_mode = values.render_mode
-    model = task.root_entity.mjcf_model
+    if self.render_mode is not None:
+      gl_contexts.check_size(env.physics.model, *_SIZE)
+    model = env.task.root_entity.mjcf_model
     has_camera = model.find('camera', _CAMERA) is not None
     self.frame = (_CAMERA if has_camera else _FREE, *_SIZE)

@@ -6,6 +6,7 @@ import numpy as np
 from stable_baselines3.common import vec_env
 
 from realab_suite import errors
+from realab_suite.doors.gymnasium import interfaces
 from realab_suite.doors.gymnasium import vector
 
 
@@ -44,7 +45,13 @@ class RealabVecEnv(vec_env.VecEnv):
     )
 
   def reset(self) -> Any:
-    """Starts new episodes; returns the observations."""
+    """Starts new episodes; returns the observations.
+
+    Raises:
+      SpecError: If `set_options` has set an option.
+    """
+    for options in self._options:
+      interfaces.check_names(options, ())
     observations, _ = self._envs.reset(seed=self._seeds[0])
     self._reset_seeds()
     self._reset_options()

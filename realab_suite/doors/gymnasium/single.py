@@ -1,15 +1,19 @@
 """One world with the interface of Gymnasium."""
 
+from collections.abc import Iterator
+import contextlib
 from typing import Any, final
 
 import gymnasium as gym
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.config import messages
 from realab_suite.doors.gymnasium import codecs
 from realab_suite.doors.gymnasium import interfaces
 from realab_suite.engine import agent_view
 from realab_suite.engine import environment
+from realab_suite.engine import gl_contexts
 
 
 @final
@@ -41,12 +45,13 @@ class RealabEnv(agent_view.Uncopied, gym.Env):
     """
     self._environment = env
     self._view = agent_view.AgentView(env)
-    self._interface = interfaces.Interface(self._view, env.task, options)
+    self._interface = interfaces.Interface(self._view, env, options)
     self.metadata = self._interface.metadata
     self.render_mode = self._interface.render_mode
     self.observation_space = self._interface.observations.space
     self.action_space = self._interface.actions.space
     self._is_over = True
+    self._keeps_seed = False
 
   def reset(
       self,
@@ -58,11 +63,20 @@ class RealabEnv(agent_view.Uncopied, gym.Env):
 
     Args:
       seed: New seed, or `None`.
-      options: Ignored.
+      options: `None` or an empty dict.
 
     Returns:
       The observation and an empty dict.
+
+    Raises:
+      SpecError: If there are options, or a seed in an evaluation.
     """
+    interfaces.check_names(options or (), ())
+    if seed is not None and self._keeps_seed:
+      raise errors.SpecError(
+          f'reset: a wrapper passes seed {messages.quote(seed)} in an'
+          ' evaluation; must be None, because every episode would be the same'
+      )
     super().reset(seed=seed, options=options)
     if seed is not None:
       self._environment.rewind(random=seed)
@@ -107,16 +121,13 @@ class RealabEnv(agent_view.Uncopied, gym.Env):
     """Returns a frame for people, `(height, width, 3)` uint8, or `None`."""
     if self.render_mode is None:
       return None
-    camera, height, width = self._interface.frame
-    frame: np.ndarray = self._environment.physics.render(
-        height, width, camera_id=camera
-    )
-    return frame
+    return gl_contexts.frame(self._environment.physics, *self._interface.frame)
 
   def close(self) -> None:
     """Frees the world. Closing it again has no effect."""
     self._view.close()
     self._environment.close()
+    self._is_over = False  # The view refuses steps from here on.
 
   def _reward(self, observation: dict[str, np.ndarray]) -> float:
     key = self._interface.reward_key
@@ -139,3 +150,14 @@ def environment_of(env: gym.Env) -> environment.Environment:
         ' realab_suite.doors.gymnasium, which may be wrapped'
     )
   return base._environment
+
+
+@contextlib.contextmanager
+def keeping_seed(env: gym.Env) -> Iterator[None]:
+  """Returns a context in which resets of a `RealabEnv` with a seed fail."""
+  base: Any = env.unwrapped
+  before, base._keeps_seed = base._keeps_seed, True
+  try:
+    yield
+  finally:
+    base._keeps_seed = before

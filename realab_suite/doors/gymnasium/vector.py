@@ -1,5 +1,6 @@
 """A batch of worlds with the interface of Gymnasium's vector environments."""
 
+from collections.abc import Sequence
 from typing import Any, final
 
 import gymnasium as gym
@@ -51,7 +52,7 @@ class RealabVectorEnv(agent_view.Uncopied, gym.vector.VectorEnv):
     self.autoreset_mode = _checked_mode(autoreset_mode)
     self._batch = batch
     self._view = agent_view.BatchAgentView(batch)
-    self._interface = interfaces.Interface(self._view, batch.task, options)
+    self._interface = interfaces.Interface(self._view, batch, options)
     self.metadata = {
         **self._interface.metadata,
         'autoreset_mode': self.autoreset_mode,
@@ -80,9 +81,10 @@ class RealabVectorEnv(agent_view.Uncopied, gym.vector.VectorEnv):
     """Starts the next episodes, or the first ones of a seed.
 
     Args:
-      seed: New seed of all worlds, or a sequence with one for each; `None` for
-        the present ones. With one seed, worlds still differ, because their
-        random streams depend on the index.
+      seed: New seed of all worlds, or a sequence with one for each; `None`,
+        alone or in a sequence, for the next episode of the present one. With
+        one seed, worlds still differ, because their random streams depend on
+        the index.
       options: `None`, or a dict. `reset_mask`, `(worlds,)` bool, selects the
         worlds to reset; `seed` is then `None`.
 
@@ -90,14 +92,18 @@ class RealabVectorEnv(agent_view.Uncopied, gym.vector.VectorEnv):
       The observations of all worlds and an empty dict.
 
     Raises:
-      SpecError: If the mask is invalid or is given with a seed.
+      SpecError: If a seed, a name or the mask is invalid, or the mask is given
+        with a seed.
     """
-    mask = (options or {}).get('reset_mask')
+    options = options or {}
+    interfaces.check_names(options, ['reset_mask'])
+    mask = options.get('reset_mask')
     if mask is not None:
       self._reset_some(_checked_mask(mask, self.num_envs, seed))
       lead = (self.num_envs,)
       return self._interface.observations.encode(self._present, lead), {}
-    super().reset(seed=None if np.ndim(seed) else seed, options=options)
+    is_one = not isinstance(seed, Sequence | np.ndarray)
+    super().reset(seed=seed if is_one else None, options=options)
     if seed is not None:
       self._batch.rewind(seed)
     time_step = self._view.reset()
@@ -170,6 +176,8 @@ class RealabVectorEnv(agent_view.Uncopied, gym.vector.VectorEnv):
     del kwargs
     self._view.close()
     self._batch.close()
+    # From here on, steps are refused as those of a closed world.
+    self._has_begun, self._is_over = True, np.zeros(self.num_envs, bool)
 
   def _reset_some(self, mask: np.ndarray) -> batch_time_steps.BatchTimeStep:
     """Resets the worlds of a mask; returns their first time steps."""

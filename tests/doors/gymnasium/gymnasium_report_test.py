@@ -195,6 +195,28 @@ def test_wrong_arguments_are_refused_before_anything_is_written(
   assert not folder.exists()
 
 
+@pytest.mark.parametrize('is_once', [True, False])
+def test_a_wrapper_that_passes_a_seed_is_refused_before_anything_else(
+    tmp_path, is_once
+):
+  class Reseeding(gym.Wrapper):
+
+    def reset(self, **options: Any) -> Any:
+      return self.env.reset(**{**options, 'seed': 3})
+
+  def wrap(env: gym.Env) -> gym.Env:
+    if is_once:
+      env.reset(seed=3)
+    return env if is_once else Reseeding(env)
+
+  folder = tmp_path / 'new'
+  with pytest.raises(errors.SpecError, match='wrapper passes seed 3'):
+    gymnasium_report.write(
+        _NAME, {'a': [_still]}, str(folder), wrap=wrap, **_SHORT
+    )
+  assert not folder.exists()
+
+
 def test_only_worlds_of_this_package_have_reports(tmp_path):
   with pytest.raises(errors.SpecError, match='CartPole'):
     gymnasium_report.write('CartPole-v1', {'a': [_still]}, str(tmp_path))

@@ -35,6 +35,16 @@ def test_their_checker_has_no_warnings():
   env_checker.check_env(gym.make(_NAME, **_OPTIONS).unwrapped)
 
 
+def test_options_of_resets_are_refused():
+  envs = sb3.RealabVecEnv(_make())
+  for options in ({'sed': 1}, [{}, {'reset_mask': True}]):
+    envs.set_options(options)
+    with pytest.raises(errors.SpecError, match=r'options: .* none'):
+      envs.reset()
+  envs.set_options({})
+  envs.reset()
+
+
 def test_ends_have_a_terminal_observation():
   envs, plain = sb3.RealabVecEnv(_make()), _make('NextStep')
   envs.seed(3)

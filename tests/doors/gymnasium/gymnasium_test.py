@@ -10,6 +10,10 @@ import pytest
 
 pytest.importorskip('gymnasium')
 
+from dm_control import mujoco
+from dm_control.locomotion import arenas
+from dm_control.locomotion import tasks
+from dm_control.locomotion import walkers
 import gymnasium as gym
 from gymnasium.utils import env_checker
 
@@ -18,6 +22,7 @@ from realab_suite import policies
 from realab_suite import suite
 from realab_suite.doors.gymnasium import evaluation
 from realab_suite.doors.gymnasium import registration
+from realab_suite.doors.gymnasium import single
 from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
 from realab_suite.engine import single_physics
@@ -215,7 +220,7 @@ def _make_vec(mode: str = 'NextStep', **options: Any) -> Any:
   )  # fmt: skip
 
 
-def _sync(mode: str, **options: Any) -> Any:
+def _sync(mode: str = 'NextStep', **options: Any) -> Any:
   """Returns the same worlds in Gymnasium's own vector environment."""
 
   def maker(world: int) -> Any:
@@ -276,6 +281,87 @@ def test_a_batch_does_what_gymnasiums_vector_of_its_worlds_does(mode, flat):
   envs.close()
 
 
+def test_a_world_without_a_new_seed_begins_its_next_episode():
+  options: Any = {'task_kwargs': {'random': 4}}
+  envs, sync = _make_vec(**options), _sync(**options)
+  for seeds in (
+      [None, 7, None], [None, 2**70, 7], [None] * _NUM_ENVS, [5, None, 6],
+      (None, 3, None), None, [1, 2, 3], [None, None, 3],
+  ):  # fmt: skip
+    _assert_same(envs.reset(seed=seeds), sync.reset(seed=seeds))
+    actions = envs.action_space.sample()
+    for _ in range(2):
+      _assert_same(envs.step(actions)[:4], sync.step(actions)[:4])
+  expected = envs.reset(seed=[1, 2, 3])
+  _assert_same(envs.reset(seed=np.array([1, 2, 3])), expected)
+  for seeds in ([1, None], [], [[1], 2, None], [-1, 2, 3], '123', np.array(1)):
+    with pytest.raises(errors.SpecError, match='random: '):
+      envs.reset(seed=seeds)
+
+
+@pytest.mark.parametrize('name', ['sed', 'reset_masks', 'seed'])
+def test_unknown_options_of_a_reset_are_refused(name):
+  one, many = _make(), _make_vec()
+  for env, allowed in ((one, 'none'), (many, 'reset_mask')):
+    with pytest.raises(errors.SpecError, match=rf"'{name}'.*: {allowed}\)"):
+      env.reset(options={name: np.ones(_NUM_ENVS, bool)})
+    env.reset(options={})
+
+
+@pytest.mark.parametrize('has_begun', [True, False])
+def test_a_closed_world_and_a_closed_batch_raise_the_same(has_begun):
+  frames: Any = {'render_mode': 'rgb_array'}
+  for env in (_make(**frames), _make_vec(**frames)):
+    if has_begun:
+      env.reset()
+    env.close()
+    for use in (
+        env.reset,
+        lambda env=env: env.reset(seed=1),
+        lambda env=env: env.step(env.action_space.sample()),
+        env.render,
+    ):
+      with pytest.raises(errors.ClosedError):
+        use()
+    env.close()
+
+
+def test_what_the_renderer_raises_is_the_same_in_a_world_and_a_batch(
+    monkeypatch,
+):
+  def fail(*args: Any, **kwargs: Any) -> Any:
+    raise ValueError('lost')
+
+  frames: Any = {'render_mode': 'rgb_array'}
+  envs = _make(**frames), _make_vec(**frames)
+  monkeypatch.setattr(mujoco.Physics, 'render', fail)
+  for env in envs:
+    env.reset()
+    with pytest.raises(errors.RenderingError, match=r'240 x 320 .*\(lost\)'):
+      env.render()
+
+
+@pytest.mark.parametrize(('height', 'width'), [(240, 319), (239, 320)])
+def test_frames_without_room_are_refused_when_a_world_is_made(height, width):
+  def load() -> environment.Environment:
+    arena = arenas.Floor((8, 8))
+    buffer = getattr(arena.mjcf_model.visual, 'global')
+    buffer.offheight, buffer.offwidth = height, width
+    task = tasks.GoToTarget(walkers.RollingBallWithHead(), arena)
+    return suite.embed(task, 'none', max_steps=2)
+
+  single.RealabEnv(load())
+  with pytest.raises(errors.SpecError, match=r'3?[24]0; must .*buffer'):
+    single.RealabEnv(load(), render_mode='rgb_array')
+
+
+@pytest.mark.parametrize('size', [(0, 9), (9, -1), (1.5, 9), (9, 641)])
+def test_frames_that_are_no_frames_are_refused(size):
+  batch = suite.load_batch('unlock_door', 'near', num_envs=1)
+  with pytest.raises(errors.SpecError, match=r'(height|width): .*buffer'):
+    batch.render(None, 'top_down', *size)
+
+
 def test_the_reading_of_a_first_step_is_no_reward():
   envs = _make_vec(overrides=['registers.reward.initial=3'])
   envs.reset(seed=1)
@@ -297,6 +383,23 @@ def test_an_evaluation_is_that_of_the_evaluator():
   expected = evaluate.evaluate(other, lambda _: action, 2)
   assert found == expected
   assert found[0].is_valid
+
+
+class _Reseeding(gym.Wrapper):
+  """Begins the first episode of a seed with every reset."""
+
+  def reset(self, *, seed=None, options=None):
+    return self.env.reset(seed=5 if seed is None else seed, options=options)
+
+
+@pytest.mark.parametrize('seed', [5, 7])
+def test_a_wrapper_that_passes_a_seed_is_refused_at_the_first_reset(seed):
+  env = _Reseeding(_make(task_kwargs={'random': seed}))
+  actions: list[Any] = []
+  with pytest.raises(errors.SpecError, match='wrapper passes seed 5'):
+    evaluation.evaluate(env, actions.append, 2)
+  assert not actions
+  env.reset()  # Outside an evaluation, seeds are its own affair.
 
 
 def test_an_episode_that_a_wrapper_ends_is_given_up():
