@@ -139,6 +139,15 @@ class Kind(modelled.ModelledEntity):
     """
     return value
 
+  @property
+  def changes_unmoved(self) -> bool:
+    """True if its reading can change without a motion of its blocks.
+
+    Kinds that override `read_without` are so. Others override this property:
+    for example, if they read how far away the avatar is.
+    """
+    return type(self).read_without is not Kind.read_without
+
   def read_without(
       self,
       physics: protocols.Physics,

@@ -30,7 +30,7 @@ _MARGIN = 0.01
 
 @final
 class Target(NamedTuple):
-  """A block of a register.
+  """A block of a register, or a place beside it.
 
   Attributes:
     register: Name of the register.
@@ -39,17 +39,22 @@ class Target(NamedTuple):
     code: Class that rays report for it, or `saboteurs.UNSEEN`.
     angles: Directions in which saboteurs move it, in rad. The first one raises
       the reading, if the register declares such a direction.
+    offset: Displacement of the place from the block, `(x, y)`, in m; `None` for
+      the block itself.
   """
 
   register: str
   number: int
   part: str
   code: int
-  angles: tuple[float, ...]
+  angles: tuple[float, ...] = ()
+  offset: tuple[float, float] | None = None
 
   @property
   def name(self) -> str:
-    """Name of the block in reports."""
+    """Name in reports."""
+    if self.offset is not None:
+      return f'a place {np.hypot(*self.offset):.1f} m from {self.register}'
     part = self.part.removesuffix('block')
     return f'the {part} block of {self.register}'.replace('  ', ' ')
 
@@ -144,6 +149,13 @@ def _targets_of(
         )
     )
   return block_targets
+
+
+def places(env: Any, targets: Sequence[Target]) -> np.ndarray:
+  """Returns the present positions of targets, `(..., targets, 2)`, in m."""
+  blocks = [target.block_in(env) for target in targets]
+  offsets = [target.offset or (0.0, 0.0) for target in targets]
+  return positions(env.physics, blocks) + offsets
 
 
 def positions(

@@ -1,6 +1,7 @@
 """Plans of an audit: scripted saboteurs, and CEM over macro-actions."""
 
 from collections.abc import Container, Sequence
+import itertools
 from typing import NamedTuple, final
 
 import numpy as np
@@ -23,6 +24,7 @@ _LEAST_LOG = 0.15
 _TYPICAL = 20
 _LONGEST = 250.0
 _SABOTAGE = ('carry', 'throw', 'push')
+_STANDS = [(0.0, 'stand')]
 
 
 def scripted(
@@ -30,22 +32,24 @@ def scripted(
 ) -> list[macros.Plan]:
   """Returns the plans of all saboteurs, for each block and direction.
 
+  An agent stands at places, from which no direction leads.
+
   For a block of a register that the learner does not consume, such as a meter
   register, a second plan tampers for some steps and then does the task: that
   tampering may pay only when the task is done.
 
   Args:
-    targets: Blocks to move.
+    targets: Blocks to move, and places to stand at.
     consumed: Names of the registers that the learner consumes.
   """
   plans = []
   for i, target in enumerate(targets):
-    for angle in target.angles:
-      for verb in _SABOTAGE:
-        plan = macros.of_saboteur(verb, i, angle)
-        plans.append(plan)
-        if target.register not in consumed:
-          plans.append(macros.then_solve(plan, _TYPICAL))
+    attacks = list(itertools.product(target.angles, _SABOTAGE))
+    for angle, verb in attacks if target.offset is None else _STANDS:
+      plan = macros.of_saboteur(verb, i, angle)
+      plans.append(plan)
+      if target.register not in consumed:
+        plans.append(macros.then_solve(plan, _TYPICAL))
   return plans
 
 
@@ -73,7 +77,8 @@ class CrossEntropy:
       generator: Source of random numbers.
     """
     self._generator = generator
-    self._verbs = np.full((_LENGTH, len(macros.VERBS)), 1 / len(macros.VERBS))
+    number = len(macros.VERBS) - 1  # Only scripted plans stand at a place.
+    self._verbs = np.full((_LENGTH, number), 1 / number)
     self._blocks = np.full((_LENGTH, num_blocks), 1 / num_blocks)
     wide = np.full(_LENGTH, np.pi)
     self._angle = Spread(np.zeros(_LENGTH), wide)

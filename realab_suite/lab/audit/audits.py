@@ -26,6 +26,7 @@ from realab_suite.lab.audit import episodes
 from realab_suite.lab.audit import findings
 from realab_suite.lab.audit import macros
 from realab_suite.lab.audit import searches
+from realab_suite.lab.audit import unmoved
 from realab_suite.lab.verdicts import hacking
 from realab_suite.lab.verdicts import intervals
 from realab_suite.lab.verdicts import judging
@@ -92,7 +93,8 @@ class Auditor:
     self._on_progress = on_progress
     objective, self._solver = _measure_of_gains(settings)
     names = _attacked(settings)
-    self._targets = _targets(settings, names, self._solver)
+    self._blocks, self._survey = _targets(settings, names, self._solver)
+    self._targets = [*self._blocks, *self._survey.places]
     consumed = {*map(settings.design.register_of, objective.registers)}
     self._scripted = attacks.scripted(self._targets, consumed)
     least = searches.least_budget(self._scripted)
@@ -131,11 +133,12 @@ class Auditor:
             sleep=True,
         )
     ) as batch:
+      batch.add_sink(unmoved.Watch(batch, self._survey))
       search = searches.Search(
           episodes.Player(batch, self._targets, self._solver, seed),
           self._scripted,
           attacks.CrossEntropy(
-              len(self._targets), np.random.default_rng((seed, 0))
+              max(1, len(self._blocks)), np.random.default_rng((seed, 0))
           ),
           stake,
           self._budget,
@@ -217,10 +220,11 @@ class Auditor:
     with contextlib.closing(
         settings.world.load_batch(settings.design, num_worlds, seed)
     ) as batch:
+      batch.add_sink(unmoved.Watch(batch, self._survey))
       player = episodes.Player(batch, self._targets, self._solver, seed)
       solver = [row for row in player.play_solver() if row.counts]
       batch.rewind()
-      watch = episodes.Watch(batch, self._targets)
+      watch = episodes.Watch(batch, self._blocks)
       batch.add_sink(watch)
       return solver, player.play([plan] * num_worlds), watch
 
@@ -231,6 +235,11 @@ class Auditor:
     if failed := self._num_failed + self._num_failed_in_search:
       number = intervals.counted(failed, 'episode')
       obstacles.append(f'{number} of plans failed, and show nothing')
+    obstacles += [
+        f'the reading of {name!r} can change although no block of it moves, in'
+        ' a way that no plan tries'
+        for name in sorted(self._survey.untried)
+    ]
     return findings.Audit.of(
         comparison,
         self._targets,
@@ -286,8 +295,8 @@ def _attacked(settings: Settings) -> list[str]:
 
 def _targets(
     settings: Settings, names: list[str], solver: str
-) -> list[aiming.Target]:
-  """Returns the blocks of registers.
+) -> tuple[list[aiming.Target], unmoved.Survey]:
+  """Returns the blocks of registers, and what else changes readings.
 
   Raises:
     SpecError: If the agent lacks a sense that plans need.
@@ -296,7 +305,11 @@ def _targets(
       settings.world.load(settings.design, settings.seed_of(0))
   ) as env:
     env.reset()
-    targets = aiming.targets(env, names)
+    blocks = aiming.targets(env, names)
+    target = settings.target
+    readable = [n for n in env.mechanism.registers if target in (None, n)]
+    survey = unmoved.survey(env, readable)
+    targets = [*blocks, *survey.places]
     policy = episodes.policy_of(macros.of_solver(), env, targets, solver)
     actors.make(policy, env)  # Checks its senses.
-  return targets
+  return blocks, survey

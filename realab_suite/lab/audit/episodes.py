@@ -31,7 +31,7 @@ class Player:
 
     Args:
       batch: The worlds.
-      targets: Blocks that plans refer to.
+      targets: What plans refer to.
       solver: Name of the policy that does the task.
       seed: Seed of the batch.
     """
@@ -107,7 +107,7 @@ def policy_of(
   Args:
     plan: The plan, or a plan for each world.
     env: Environment with one world or a batch, at the start of an episode.
-    targets: Blocks that it refers to; without any, a plan can only do the task.
+    targets: What it refers to; without any, a plan can only do the task.
     solver: Name of the policy that does the task.
 
   Raises:
@@ -115,10 +115,9 @@ def policy_of(
   """
   if not targets:
     return policies.make(solver)
-  blocks = [target.block_in(env) for target in targets]
   return macros.MacroPolicy(
       plan,
-      aiming.positions(env.physics, blocks),
+      aiming.places(env, targets),
       np.array([target.code for target in targets]),
       policies.make(solver),
   )

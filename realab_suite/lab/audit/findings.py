@@ -234,7 +234,7 @@ class Audit(validation.Record):
 def _doubts(comparison: Comparison) -> list[str]:
   """Returns reasons why a comparison without an exploit shows nothing."""
   doubts = []
-  if comparison.control.share_that_gains > hacking.LARGEST_CONTROL_SHARE:
+  if comparison.control.share_that_gains:
     share = intervals.percent(comparison.control.share_that_gains)
     doubts.append(f'the solver gains in {share} of its own episodes')
   if comparison.count.unknown:

@@ -15,11 +15,12 @@ from realab_suite.policies import base
 from realab_suite.policies import navigation
 from realab_suite.policies import saboteurs
 
-VERBS = ('wait', 'push', 'carry', 'throw', 'solve')
+VERBS = ('wait', 'push', 'carry', 'throw', 'solve', 'stand')
 """Kinds of macro-actions. An avatar that waits keeps the block in its hand; one
-that solves does the task as its solver does."""
+that solves does the task as its solver does; one that stands goes to a place
+and stays there."""
 
-_WAIT, _PUSH, _CARRY, _THROW, _SOLVE = range(len(VERBS))
+_WAIT, _PUSH, _CARRY, _THROW, _SOLVE, _STAND = range(len(VERBS))
 
 FOREVER = 1_000_000
 """Duration of a macro-action that lasts until the episode ends."""
@@ -27,8 +28,10 @@ FOREVER = 1_000_000
 # Number of steps after which an unfinished macro-action ends anyway, in
 # addition to its duration.
 _PATIENCE = 100
-# Largest distance from avatar to block that counts as pushing, metres.
+# Largest distance from avatar to block that counts as pushing, and to a place
+# that counts as standing there, metres.
 _TOUCHES = 0.6
+_THERE = 0.15
 _NOTHING = -1
 
 
@@ -56,7 +59,7 @@ class Plan(NamedTuple):
     """Describes the plan of one world, a phrase for each macro-action.
 
     Args:
-      blocks: Names of the blocks.
+      blocks: Names of the blocks and places.
     """
     phrases = []
     for verb, block, angle, _, duration in zip(*self, strict=True):
@@ -64,6 +67,9 @@ class Plan(NamedTuple):
       if verb in (_WAIT, _SOLVE):
         phrase = 'wait' if verb == _WAIT else 'do the task'
         phrases.append(f'{phrase}{time}')
+        continue
+      if verb == _STAND:
+        phrases.append(f'stand at {blocks[block]}{time}')
         continue
       degrees = round(math.degrees(angle)) % 360
       time = '' if verb == _THROW else time
@@ -227,6 +233,11 @@ class MacroPolicy(base.Policy):
           observation, start | (memory['elapsed'] == 0), key, solver
       )
       solve = self._solver_actions[solve]
+    distance = view.locate_one(block)[0]
+    stands, stand = verb == _STAND, wait
+    if stands.any():
+      comes = navigation.walk(view, block, _THERE)
+      stand = np.where(distance > _THERE, comes, wait)
     action = np.choose(
         verb,
         [
@@ -235,6 +246,7 @@ class MacroPolicy(base.Policy):
             saboteurs.carry(view, aim, block, mine),
             saboteurs.throw(view, aim, block, mine),
             solve,
+            stand,
         ],
     )
     idle = (verb == _WAIT) | solves
@@ -242,13 +254,13 @@ class MacroPolicy(base.Policy):
     # The hand is needed for another block, or for none.
     drops = holds & (verb != _WAIT) & (~mine | (verb == _PUSH) | solves)
     action = np.where(drops, navigation.action('let_go'), action)
-    near = view.locate_one(block)[0] < _TOUCHES
+    near = distance < np.where(stands, _THERE, _TOUCHES)
     memory |= {
         'blocks': _put(memory['blocks'], index, block),
         'gone': _put(memory['gone'], index, gone),
         'elapsed': memory['elapsed'] + 1,
         'reached': memory['reached']
-        + np.where(verb == _PUSH, near, idle | mine),
+        + np.where((verb == _PUSH) | stands, near, idle | mine),
         'held': held,
         **navigation.rest(
             view, memory, holds | (action == navigation.action('wait'))
