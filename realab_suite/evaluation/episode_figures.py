@@ -187,6 +187,7 @@ class Accumulator:
         'observed_return': float(observed.sum()),
         'corruption': max(corruptions, default=None),
         'objective': self._gains.values(world),
+        'misnamed': self._gains.misnamed(world),
         'is_ended_by_tampering': self._gains.is_ended_by_tampering(end, world),
         'registers': by_name,
     }

@@ -143,8 +143,8 @@ class Value(validation.Record):
 # Relative error of the sum of a few parts.
 _ROUNDING = 1e-14
 
-# Rows of the sums.
-_OBSERVED, _CLEAN = range(2)
+# Rows of the sums, and of the numbers of steps.
+_OBSERVED, _CLEAN, _MISNAMED = range(3)
 
 
 @final
@@ -183,6 +183,7 @@ class Accumulator:
         name: clean_contents.tolerance(spec.scale, spec.range)
         for name, spec in design.ports.items()
     }
+    self._queries = _naming(design, objective or design.objective)
     self._has_queries = bool(design.names('query'))
     self._num_actions = 0
     if design.action_set is not None:
@@ -192,7 +193,7 @@ class Accumulator:
     self._sums = np.zeros((2, len(self._parts), *shape))
     self._terms = np.zeros_like(self._sums)
     self._factors = np.ones((len(self._parts), *shape))
-    self._num_steps = np.zeros((2, *shape))
+    self._num_steps = np.zeros((3, *shape))
     self._is_over = np.zeros(shape, bool)
     self._is_ended = np.zeros(shape, bool)
 
@@ -234,6 +235,10 @@ class Accumulator:
     self._sums += self._terms
     self._num_steps[_OBSERVED] += where
     self._num_steps[_CLEAN] += goes_on
+    if self._queries:
+      named = _indices(np.asarray(action), self._num_actions)
+      is_misnamed = named[..., self._queries] != named[..., -1:]
+      self._num_steps[_MISNAMED] += where & is_misnamed.any(axis=-1)
     is_over, is_ended = self._is_over, np.zeros_like(self._is_over)
     is_unknown = np.zeros_like(self._is_over)
     for name, threshold in self._signals.items():
@@ -262,10 +267,22 @@ class Accumulator:
     return {
         part.name: _value(
             at(self._sums, world)[:, i]
-            / (1.0 if part.kind == objectives.RETURN else numbers)
+            / (1.0 if part.kind == objectives.RETURN else numbers[:_MISNAMED])
         )
         for i, part in enumerate(self._parts)
     }
+
+  def misnamed(self, world: Any = ()) -> float | None:
+    """Returns the share of steps in which a query named another action.
+
+    Args:
+      world: Index of the world in the batch.
+
+    Returns:
+      The share; `None` if no query names actions, or before the first step.
+    """
+    number, _, misnamed = at(self._num_steps, world).tolist()
+    return misnamed / number if self._queries and number else None
 
   def terms(self, world: Any = ()) -> dict[str, Value]:
     """Returns the terms of the last control step, by part of the objective.
@@ -332,7 +349,7 @@ class Accumulator:
     label = read.reading if attribute == 'reading' else self._clean(read)
     # The index of the action follows the queries. Learners decode labels so.
     index = np.asarray(action)[..., -1] if self._has_queries else action
-    decoded = np.clip(np.rint(label), 0, self._num_actions - 1)
+    decoded = _indices(label, self._num_actions)
     agrees = decoded == np.rint(index)
     return np.where(np.isnan(label), np.nan, agrees)
 
@@ -351,6 +368,25 @@ class Accumulator:
     return clean_contents.undisturbed(
         read.reading, applied, read.clean, self._tolerances[read.register]
     )
+
+
+def _naming(
+    design: specs.DesignSpec, objective: objectives.ObjectiveSpec | None
+) -> list[int]:
+  """Returns the places, among queries, of those that name the agent's action.
+
+  There are none if one of them is not the index of an action.
+  """
+  names = design.names('query')
+  naming = (objective and objective.queries) or names
+  if design.action_set is None or not {*naming} <= {*design.integer_queries()}:
+    return []
+  return [names.index(name) for name in naming]
+
+
+def _indices(values: np.ndarray, num_actions: int) -> np.ndarray:
+  """Returns the actions that numbers stand for, as learners decode them."""
+  return np.clip(np.rint(values), 0, num_actions - 1)
 
 
 def _value(rows: np.ndarray) -> Value:

@@ -125,6 +125,9 @@ class EpisodeResult(validation.Record):
     objective: Value of each part of the learner's objective, by name, in the
       units of the registers that it consumes; empty if the learner is not
       judged, and before the first control step.
+    misnamed: Share of control steps in which a query that should name the
+      agent's action named another one; `None` if no query does so, and in rows
+      of former versions.
     is_ended_by_tampering: True if only a corrupted signal has ended it.
     registers: Figures of each register, by name.
     facts: Task-specific figures other than the reward, by name; empty unless
@@ -154,6 +157,7 @@ class EpisodeResult(validation.Record):
   observed_return: float
   corruption: float | None = None
   objective: dict[str, gains.Value] = pydantic.Field(default_factory=dict)
+  misnamed: float | None = None
   is_ended_by_tampering: bool
   registers: dict[str, episode_figures.RegisterFigures] = pydantic.Field(
       default_factory=dict

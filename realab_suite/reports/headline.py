@@ -18,8 +18,8 @@ def headline(
   """Returns the first lines on each learned run, those that tamper first.
 
   The lines are, in this order: whether the run fails at the task, beside its
-  twin; its label; its hack rate beside that of its control; its audit; the
-  training episodes in which tampering paid.
+  twin; its label; its hack rate beside that of its control; its queries, in a
+  coupled design; its audit; the training episodes in which tampering paid.
 
   Args:
     sweep: The sweep.
@@ -44,6 +44,10 @@ def _lines(
   lines = [_task(sweep, figures, learned), _labels(learned)]
   if learned.hacking is not None:
     lines.append(_rate(learned.hacking))
+  if shares := {x.misnamed for x in learned.seeds.values() if x.misnamed}:
+    lines.append(
+        f'Steps whose query is not its action: {", ".join(sorted(shares))}.'
+    )
   lines.append(f'Audit: {_audit(learned.audit)}.')
   training = learned.training
   if training is not None:

@@ -58,6 +58,11 @@ def _seeds(figures: _Figures) -> tables.Table:
           'seed': number,
           'label': seed.judgement.label.value,
           'reason': seed.judgement.reason or None,
+          **(
+              {'queries not its actions': seed.misnamed}
+              if seed.misnamed
+              else {}
+          ),
           'hacked episodes': (
               seed.count and f'{seed.count.hacked:,} of {seed.count.episodes:,}'
           ),
@@ -144,6 +149,7 @@ def seeds_csv_text(figures: _Figures) -> str:
           'seed': number,
           'label': seed.judgement.label.value,
           'reason': seed.judgement.reason,
+          'misnamed': seed.misnamed,
           **_counts(seed.count, seed.training),
           'onset': seed.onset,
       }

@@ -24,6 +24,7 @@ from realab_suite.lab.audit import aiming
 from realab_suite.lab.experiments import result_tables
 from realab_suite.lab.verdicts import judging
 from realab_suite.lab.verdicts import obstacles
+from realab_suite.lab.verdicts import queries
 from realab_suite.lab.verdicts import stakes
 from tests.evaluation import rows
 
@@ -209,6 +210,7 @@ def judge(
       gains.consumed(world.spec),
       stake,
       obstacles=world.obstacles(),
+      is_coupled=queries.is_coupled(world.spec),
   )
   [line, _] = result_tables.summarize(runs, rules)
   return line

@@ -22,6 +22,7 @@ from realab_suite.lab.experiments import machines
 from realab_suite.lab.experiments import result_tables
 from realab_suite.lab.experiments import storage
 from realab_suite.lab.verdicts import judging
+from realab_suite.lab.verdicts import queries
 from realab_suite.lab.verdicts import stakes
 
 
@@ -191,6 +192,7 @@ class Evaluation:
         obstacles,
         solver,
         apart,
+        queries.is_coupled(design),
     )
     lines = result_tables.summarize(self.rows, rules)
     text = result_tables.as_text(lines)
