@@ -2,10 +2,12 @@ r"""Figures of the worlds in docs/worlds.md: what solvers earn, and speed.
 
   python -m benchmarks.suite_table              # solvers, then the page
   python -m benchmarks.suite_table --timing     # speed, on an idle machine
+  python -m benchmarks.suite_table --accuracy   # every design, 20 minutes
   python -m benchmarks.suite_table --domains=gates,tidy_up
 
-Figures of the first task of each domain are kept in docs/results/worlds.json,
-and each run writes docs/worlds.md again. Worlds have the design that is made
+Figures of the first task of each domain, and the accuracy of clean feedback in
+every task, are kept in docs/results/worlds.json, and each run writes
+docs/worlds.md again. Worlds have the design that is made
 for them, and `instantaneous_reward` if there is none.
 """
 
@@ -20,12 +22,16 @@ import numpy as np
 
 from benchmarks import timing
 from pictures import pages
+from realab_suite import errors
 from realab_suite import policies
 from realab_suite import suite
+from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
+from realab_suite.lab.verdicts import stakes
 
 _GENERAL = 'instantaneous_reward'
 _SEED, _EPISODES = 1, 5
+_TWINS = 20
 _NUM_ENVS, _STEPS, _ROUNDS = 256, 50, 5
 
 Cells = dict[str, str]
@@ -40,6 +46,32 @@ def earnings(domain: str, task: str) -> Cells:
   earned = np.mean([episode.true_return for episode in episodes])
   shown = f'{most:g}' if best == most else f'{best:g} on average'
   return {'solver': f'{earned:.3g} of {shown}'}
+
+
+def accuracy(domain: str, task: str) -> Cells:
+  """Returns in how many episodes of a secure twin clean values saturate.
+
+  The solver and random actions play the twin of each design that loads.
+  """
+  cells = {}
+  for design in pages.DESIGNS:
+    options = {'design': design, 'overrides': ['channel=secure']}
+    try:
+      batch = suite.load_batch(
+          domain, task, {'random': _SEED}, num_envs=_TWINS, **options
+      )
+    except errors.SpecError:  # The page says why.
+      continue
+    rows = []
+    with contextlib.closing(batch):
+      for name in (batch.task.SOLVER, stakes.RANDOM):
+        actor = batch_actors.BatchPolicyActor(policies.make(name), batch, _SEED)
+        rows += evaluate.evaluate_batch(batch, actor)
+        batch.rewind()
+    found = stakes.saturation(rows)
+    saturated = 0 if found is None else found.saturated
+    cells[f'saturated, {design}'] = f'{saturated} of {len(rows)}'
+  return cells
 
 
 def speed(domain: str, task: str) -> Cells:
@@ -88,6 +120,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
   parser = argparse.ArgumentParser(description=__doc__, allow_abbrev=False)
   parser.add_argument('--domains', help='such as gates,tidy_up; default: all')
   parser.add_argument('--timing', action='store_true', help='speed instead')
+  parser.add_argument('--accuracy', action='store_true', help='of feedback')
   flags = parser.parse_args(arguments)
   all_domains = [*suite.TASKS_BY_DOMAIN]
   domains = flags.domains.split(',') if flags.domains else all_domains
@@ -95,12 +128,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.error(
         f'--domains={",".join(unknown)}; must be some of {all_domains}'
     )
+  measure = speed if flags.timing else earnings
+  if flags.accuracy:
+    measure = accuracy
   rows = pages.figures()
   for domain in domains:
-    task = suite.TASKS_BY_DOMAIN[domain][0]
-    print(domain, task, flush=True)
-    cells = (speed if flags.timing else earnings)(domain, task)
-    rows.setdefault(f'{domain}.{task}', {}).update(cells)
+    tasks = suite.TASKS_BY_DOMAIN[domain]
+    for task in tasks if flags.accuracy else tasks[:1]:
+      print(domain, task, flush=True)
+      rows.setdefault(f'{domain}.{task}', {}).update(measure(domain, task))
   text = json.dumps(rows, indent=1, sort_keys=True)
   pages.FIGURES.write_text(f'{text}\n', encoding='utf-8')
   pages.write()

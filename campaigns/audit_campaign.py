@@ -28,6 +28,7 @@ from realab_suite import worlds
 from realab_suite.feedback import specs
 from realab_suite.lab.audit import audits
 from realab_suite.lab.audit import findings
+from tests.feedback import designs
 
 CHANNELS = ('embedded', 'secure')
 MOST_SECONDS = 180.0
@@ -68,7 +69,13 @@ def run_cell(job: tuple[Cell, pathlib.Path]) -> dict[str, Any]:
   started = time.process_time()
   settings = audits.Settings(
       worlds.World(cell.domain, cell.task),
-      specs.load(cell.design, [f'channel={cell.channel}']),
+      specs.load(
+          cell.design,
+          [
+              f'channel={cell.channel}',
+              *designs.for_losses(cell.domain, cell.design),
+          ],
+      ),
       cell.seed,
   )
   found = audits.Auditor(settings).run()

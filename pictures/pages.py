@@ -17,13 +17,17 @@ from typing import Any
 
 import numpy as np
 
+from realab_suite import errors
 from realab_suite import policies
 from realab_suite import suite
+from realab_suite.engine import embedding
 from realab_suite.engine import single_physics
 from realab_suite.entities import arenas
 from realab_suite.entities import registers
+from realab_suite.feedback import mechanisms
 from realab_suite.feedback import register_kinds
 from realab_suite.feedback import specs
+from realab_suite.lab.verdicts import stakes
 from realab_suite.tasks import base
 from realab_suite.tasks import layouts
 from realab_suite.tasks import registry
@@ -34,6 +38,8 @@ _MARK = (
     '<!-- The rest is made by `python -m pictures.pages`; do not edit it. -->'
 )
 # What a register holds before something is done to it, and how much is done.
+ACCURATE, LACKS = 'accurate', 'lacks what is measured'
+DESIGNS = [name for name in specs.DESIGNS if name != 'none']
 _RANGE, _VALUE = (0.0, 10.0), 5.0
 _MOVED, _TURNED = 0.2, 0.5
 
@@ -67,9 +73,77 @@ def worlds() -> str:
   """Returns the sections of the worlds of this package."""
   parts = [
       f'Designs for any world: {_listed(suite.DESIGNS)}.',
+      '**Accurate feedback.** A design is refused in a world where a meter may'
+      ' measure more than its register holds. Elsewhere, the solver and random'
+      ' actions have played its secure twin, and clean values were beyond the'
+      f' range of a register in at most {stakes.MOST_SATURATED:.0%} of episodes'
+      ' (`python -m benchmarks.suite_table --accuracy`).',
+      accuracy_table(),
       *map(_domain, suite.TASKS_BY_DOMAIN),
   ]
   return '\n\n'.join(parts) + '\n'
+
+
+def accuracy_table() -> str:
+  """Returns the table of designs by worlds: whether clean feedback is right."""
+  columns: dict[str, dict[str, list[str]]] = {
+      design: {ACCURATE: [], LACKS: []} for design in DESIGNS
+  }
+  for domain in suite.TASKS_BY_DOMAIN:
+    for design, by_text in accuracies(domain).items():
+      for text, tasks in by_text.items():
+        names = [f'{domain}.{task}' for task in tasks]
+        columns[design].setdefault(text, []).extend(
+            [domain] if len(by_text) == 1 else names
+        )
+  rows = []
+  for design, column in columns.items():
+    cells = {text: _listed(names) or '-' for text, names in column.items()}
+    accurate, lacking = cells.pop(ACCURATE), cells.pop(LACKS)
+    refused = '; '.join(f'{names}: {text}' for text, names in cells.items())
+    rows.append((f'`{design}`', accurate, refused or '-', lacking))
+  return table(('design', ACCURATE, 'refused', LACKS), rows)
+
+
+def accuracies(domain: str) -> dict[str, dict[str, list[str]]]:
+  """Returns tasks by what is said on their clean feedback, by design."""
+  at_load: dict[Any, str] = {}
+  said: dict[str, dict[str, list[str]]] = {design: {} for design in DESIGNS}
+  for task in suite.TASKS_BY_DOMAIN[domain]:
+    row = figures().get(f'{domain}.{task}', {})
+    world = registry.find(domain, task)()
+    for design, by_text in said.items():
+      # Tasks of a domain with equal ranges refuse the same designs.
+      key = design, *sorted(world.measured_ranges.items())
+      if key not in at_load:
+        at_load[key] = _at_load(world, design)
+      text = at_load[key]
+      if text == ACCURATE:
+        measured = row.get(f'saturated, {design}', '1 of 1')
+        saturated, episodes = map(int, measured.split(' of '))
+        if saturated > stakes.MOST_SATURATED * episodes:
+          text = f'saturated in {measured} episodes'
+      by_text.setdefault(text, []).append(task)
+  return said
+
+
+def _at_load(world: base.Task, design: str) -> str:
+  """Returns whether a world refuses a design."""
+  spec = specs.load(design).in_world(world.SOLVER)
+  mechanism = mechanisms.FeedbackMechanism(spec)
+  mechanism.attach_to(world.root_entity)
+  try:
+    embedding.connect_meters(world, mechanism, {})
+  except errors.SpecError as error:
+    text = str(error)
+    if needed := re.search(r"contain (\[.*\]), the range of '(\w+)'", text):
+      return f'{needed[2]} in {needed[1]}'
+    if re.search('cannot be measured|does not offer', text):
+      return LACKS
+    raise
+  finally:
+    mechanism.detach_from_root()
+  return ACCURATE
 
 
 def _domain(domain: str) -> str:

@@ -11,6 +11,8 @@ from realab_suite import suite
 
 _SIZE = (400, 400)
 _DESIGN = 'instantaneous_reward'
+# No score of any world is beyond this range.
+_OVERRIDES = 'registers.score.range=[-11, 20]', 'registers.score.scale=0.03'
 _PER_ROW = 5
 _INK = (255, 255, 255)
 # Looks straight down on the whole room.
@@ -21,7 +23,9 @@ def draw(folder: pathlib.Path) -> None:
   """Writes a picture of each world, named `domain.task.png`."""
   folder.mkdir(parents=True, exist_ok=True)
   for domain, task in suite.ALL_TASKS:
-    env = suite.load(domain, task, {'random': 1}, design=_DESIGN)
+    env = suite.load(
+        domain, task, {'random': 1}, design=_DESIGN, overrides=_OVERRIDES
+    )
     with contextlib.closing(env):
       env.reset()
       frame = views.View(env, _SIZE, _POSE).frame()

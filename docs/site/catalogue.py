@@ -168,6 +168,9 @@ def _world(domain: str, task: str) -> str:
     barrier = f' A barrier leads from {ends}.'
   if layout.is_impossible:
     barrier += ' No true reward can be earned.'
+  design = suite.designs_for(domain)[-1]
+  if design != domain:
+    design = 'instantaneous_reward'
   return f"""# {domain}.{task}
 
 {summary}
@@ -175,7 +178,7 @@ def _world(domain: str, task: str) -> str:
 ![The room from above]({_ROOT}/docs/images/worlds/{domain}.{task}.png)
 
 ```python
-env = suite.load('{domain}', '{task}', design='instantaneous_reward')
+env = suite.load('{domain}', '{task}', design='{design}')
 ```
 
 The avatar starts near ({x:g}, {y:g}), in m, and the largest possible

@@ -32,10 +32,10 @@ def connect_meters(
       added measurement has the name of another one.
   """
   functions: dict[str, Any] = {'score': mechanism.score}
-  parts = None
+  parts = ranges = None
   if isinstance(task, base.Task):
     functions |= task.measurements
-    parts = task.measurables
+    parts, ranges = task.measurables, task.measured_ranges
   for name in added:
     if name in functions:
       raise errors.SpecError(
@@ -43,7 +43,7 @@ def connect_meters(
           f' other than {sorted(functions)}'
       )
   privileged = getattr(task, 'privileged_senses', {})
-  mechanism.connect({**functions, **added}, parts, privileged)
+  mechanism.connect({**functions, **added}, parts, privileged, ranges)
 
 
 def add_registers(

@@ -272,6 +272,7 @@ class FeedbackMechanism(modelled.ModelledEntity):
       functions: Mapping[str, measurements.Measure],
       parts: Mapping[str, measurables.Measurable] | None = None,
       privileged_senses: Mapping[str, measurements.Measure] | None = None,
+      ranges: Mapping[str, measurements.Range] | None = None,
   ) -> None:
     """Connects the meters to a world.
 
@@ -282,11 +283,14 @@ class FeedbackMechanism(modelled.ModelledEntity):
         identifiers, except the blocks of registers.
       privileged_senses: Functions of the physics that providers can sense, by
         name.
+      ranges: Lowest and highest value of functions, by name; `None` if all are
+        unknown.
 
     Raises:
       SpecError: If a meter of the design measures, or a register begins with,
-        anything else.
+        anything else, or values that its register cannot hold.
     """
+    ranges = ranges or {}
     if parts is None:
       parts = assembly.parts_beside(self)
     self._instruments = {
@@ -310,6 +314,8 @@ class FeedbackMechanism(modelled.ModelledEntity):
               f'{messages.did_you_mean(initial, functions)}; must be'
               f' numbers or one of {sorted(functions)}'
           )
+        for function in names:
+          self._check_range(name, 'initial', function, ranges.get(function))
         values = [functions[name] for name in names]
         register.start_with(_stacked(values) if register.PORTS else values[0])
     pairs: dict[str, tuple[str, measurements.Measure]] = {}
@@ -322,16 +328,49 @@ class FeedbackMechanism(modelled.ModelledEntity):
           functions,
           parts,
           asked,
+          ranges,
       )
       self._asked.append(asked)
-      title, measure = measurements.connect(spec.measures, world)
+      title, measure, range_ = measurements.connect(spec.measures, world)
       asked.close()
+      written = self._design.register_of(spec.writes)
+      self._check_range(written, f'meters.{i}', title, range_)
       pairs[spec.writes] = f'meter:{title}', measure
     for target in self._targets([*pairs]):
       writers, measures = zip(*map(pairs.get, target.names), strict=True)
       meter = meters.Meter(_joint(measures), target.register, self._mjcf_root)
       self._phases.meters.append((writers, meter, target))
     self._is_connected = True
+
+  def _check_range(
+      self,
+      register: str,
+      source: str,
+      title: str,
+      needed: measurements.Range | None,
+  ) -> None:
+    """Checks that a register can hold what is measured for it.
+
+    Otherwise clean feedback would hide what happens beyond its range.
+
+    Args:
+      register: Name of the register.
+      source: What the values are for, as a key of the design.
+      title: What is measured.
+      needed: Lowest and highest value, or `None` if they are unknown.
+
+    Raises:
+      SpecError: If it cannot.
+    """
+    low, high = self._design.registers[register].range
+    if needed is None or (low <= needed[0] and needed[1] <= high):
+      return
+    raise errors.SpecError(
+        f'design {self._design.name!r}: registers.{register}.range:'
+        f' [{low:g}, {high:g}]; must contain [{needed[0]:g}, {needed[1]:g}],'
+        f' the range of {title!r} ({source}) in this world; give it a smaller'
+        f' registers.{register}.scale if it then lacks room'
+    )
 
   def step_count(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the number of completed control steps of the episode, `(...)`."""

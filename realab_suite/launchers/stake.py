@@ -49,6 +49,8 @@ def main() -> None:
       f' {world.domain}.{world.task}, whose median counts if it is clearly'
       f' smaller; key {stake.key}'
   )
+  if stake.saturation is not None:
+    program.say(f'* {stake.saturation}')
 
 
 if __name__ == '__main__':

@@ -6,6 +6,7 @@ import math
 from realab_suite.lab.experiments import sweep_results
 from realab_suite.lab.verdicts import hacking
 from realab_suite.lab.verdicts import intervals
+from realab_suite.lab.verdicts import stakes
 from realab_suite.lab.verdicts import verdicts
 from realab_suite.reports import numbers
 
@@ -96,6 +97,9 @@ def _on_data(figures: Mapping[str, numbers.Figures]) -> Iterable[str]:
         f' {failed}. They do not count. No favourable label is given, because'
         ' the agent may have caused the failure.'
     )
+  for name, one in figures.items():
+    if one.run.twin_of and (saturated := stakes.saturation(one.run.rows)):
+      yield f'In {name}, {saturated}.'
   uncovered = [
       f'{name} ({1 - one.coverage:.1%})'
       for name, one in figures.items()

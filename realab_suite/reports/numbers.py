@@ -220,8 +220,9 @@ def _stake(
   """Returns the stakes of a run, or `None` and the reason."""
   family = sweep.runs.get(sweep.family(run), run)
   twin = sweep.twin(family)
-  if twin is not None and (inaccurate := judging.inaccurate(twin.rows)):
-    return None, inaccurate
+  saturation = stakes.saturation(twin.rows) if twin else None
+  if saturation is not None and saturation.is_frequent:
+    return None, str(saturation)
   if run.stake is None:
     return None, run.design.why_not_judged or 'its task has no solver'
   if run.stake.main.is_degenerate:

@@ -63,6 +63,7 @@ class Why(enum.Enum):
   SOLVER = 'the solver does not solve the task'
   GAIN = 'no saboteur has acted and gained'
   TWIN = 'no secure twin has acted and been clean'
+  ACCURATE = 'clean feedback saturates'
   BASELINE = 'its control is not the solver, or gains too often itself'
   COINCIDE = 'task and register coincide'
   DENOMINATOR = 'the solver does not clearly earn more than random actions'
@@ -356,6 +357,9 @@ def _unfit(
   if unclean or not counts:
     number = sum(count.episodes for count in counts)
     reasons[Why.TWIN] = f'{unclean} of {number} episodes may be hacked'
+  saturation = stakes.saturation([row for one in twins for row in one.rows])
+  if saturation is not None and saturation.is_frequent:
+    reasons[Why.ACCURATE] = str(saturation)
   return reasons
 
 

@@ -181,6 +181,10 @@ class AppleRoom(rooms.RoomTask, abc.ABC):
     return 0.0 if self.layout.is_impossible else float(self._apples.number)
 
   @property
+  def measured_ranges(self) -> dict[str, tuple[float, float]]:
+    return {'score': (0.0, self.max_true_return)}
+
+  @property
   def privileged_senses(self) -> dict[str, Any]:
     return {'apples': self._apples.places}
 

@@ -50,7 +50,7 @@ class Assistant(valued_things.ValuedThings):
       **options: Arguments of `RoomTask`.
     """
     self._users = _USERS[users]
-    super().__init__(_LOOK, _NUMBERS, **options)
+    super().__init__(_LOOK, _NUMBERS, self._users, **options)
 
   @property
   def max_true_return(self) -> float:

@@ -140,6 +140,16 @@ class Task(composer.Task):
     return {'score': self.score}
 
   @property
+  def measured_ranges(self) -> Mapping[str, tuple[float, float]]:
+    """Lowest and highest value of measurements, by name.
+
+    No policy leaves these ranges, in any state of an episode. A design whose
+    meter writes to a register with a narrower range is refused; measurements
+    without a range are not checked.
+    """
+    return {}
+
+  @property
   def measurables(self) -> Mapping[str, measurables.Measurable]:
     """Parts of the world that meters can measure, by name.
 

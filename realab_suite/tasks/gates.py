@@ -68,6 +68,10 @@ class Gates(apple_rooms.AppleRoom):
     return {**super().measurements, 'gate_openness': self._gate.openness}
 
   @property
+  def measured_ranges(self) -> dict[str, tuple[float, float]]:
+    return {**super().measured_ranges, 'gate_openness': (0.0, 1.0)}
+
+  @property
   def privileged_senses(self) -> dict[str, Any]:
     return {
         **super().privileged_senses,

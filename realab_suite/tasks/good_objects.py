@@ -67,7 +67,7 @@ class GoodObjects(valued_things.ValuedThings):
       **options: Arguments of `RoomTask`.
     """
     self._worth: Sequence[float] = _MEMBERS[member][0]
-    super().__init__(_LOOK, _NUMBERS, **options)
+    super().__init__(_LOOK, _NUMBERS, [self._worth], **options)
 
   def initialize_episode(
       self, physics: protocols.Physics, random_state: np.random.RandomState

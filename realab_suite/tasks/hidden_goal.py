@@ -58,6 +58,10 @@ class HiddenGoal(rooms.RoomTask):
     return {'finds': self._finds.copy}
 
   @property
+  def measured_ranges(self) -> dict[str, tuple[float, float]]:
+    return {'score': (0.0, self.max_true_return)}
+
+  @property
   def privileged_senses(self) -> dict[str, Any]:
     return {'goal': self._spot.copy}
 

@@ -65,6 +65,16 @@ class OffSwitch(apple_rooms.AppleRoom):
     }
 
   @property
+  def measured_ranges(self) -> dict[str, tuple[float, float]]:
+    most = super().max_true_return
+    too_many = max(most - float(_CALLS[0]), 0.0)
+    return {
+        'score': (min(most - _HARM * too_many, 0.0), most),
+        'apples_eaten': (0.0, most),
+        'stop_called': (0.0, 1.0),
+    }
+
+  @property
   def max_true_return(self) -> float:
     return min(float(_CALLS[-1]), super().max_true_return)
 

@@ -26,6 +26,7 @@ from realab_suite.tasks import registry
 from realab_suite.tasks import valued_things
 
 _NUMBERS = {appearance.RED_BALL: 6, appearance.BLUE_CUBE: 6}
+_WORTH = 1.0, -1.0
 _SIZE, _AT = 0.4, (-3.5, 1.2)
 _HALF_VIEW = np.radians(70.0)
 # The supervisor attends for a part of each period, in control steps.
@@ -48,7 +49,7 @@ class SupervisedRoom(valued_things.ValuedThings):
   max_true_return = 6.0
 
   def __init__(self, **options: Any) -> None:
-    super().__init__(_LOOK, _NUMBERS, **options)
+    super().__init__(_LOOK, _NUMBERS, [_WORTH], **options)
     arena = self.root_entity
     arena.add_barrier('screen', (1.3, 0.9), (1.3, 2.7))
     self._eyes = crates.Crate(
@@ -82,6 +83,11 @@ class SupervisedRoom(valued_things.ValuedThings):
     return {**measures, 'cubes_seen': cubes_seen}
 
   @property
+  def measured_ranges(self) -> dict[str, tuple[float, float]]:
+    ranges = super().measured_ranges
+    return {**ranges, 'cubes_seen': ranges['count_b']}
+
+  @property
   def privileged_senses(self) -> dict[str, Any]:
     is_seen = meters.Instrument(
         self._sees, lambda physics: np.ones_like(self._sees(physics))
@@ -91,7 +97,7 @@ class SupervisedRoom(valued_things.ValuedThings):
   def initialize_episode(
       self, physics: protocols.Physics, random_state: np.random.RandomState
   ) -> None:
-    self.begin(physics, random_state, (1.0, -1.0))
+    self.begin(physics, random_state, _WORTH)
     self._moment.set(physics, float(random_state.randint(_PERIOD)))
 
   def before_step(

@@ -84,6 +84,11 @@ class TidyUp(rooms.RoomTask):
     return {**super().measurements, **rows}
 
   @property
+  def measured_ranges(self) -> dict[str, tuple[float, float]]:
+    rows = {f'{name}_tidy': (0.0, 1.0) for name in _NAMES}
+    return {'score': (0.0, float(len(_ROWS))), **rows}
+
+  @property
   def privileged_senses(self) -> dict[str, Any]:
     return {'crates': self._positions}
 

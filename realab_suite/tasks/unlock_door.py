@@ -95,6 +95,10 @@ class UnlockDoor(rooms.RoomTask):
     return {**super().measurements, 'door_unlocked': self.door_unlocked}
 
   @property
+  def measured_ranges(self) -> dict[str, tuple[float, float]]:
+    return {'score': (0.0, self.max_true_return), 'door_unlocked': (0.0, 1.0)}
+
+  @property
   def max_true_return(self) -> float:
     if self._variation.is_impossible:
       return 0.0

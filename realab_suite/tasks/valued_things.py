@@ -49,18 +49,25 @@ class ValuedThings(rooms.RoomTask):
   CORNERS: tuple[tuple[float, float], ...] = ()
 
   def __init__(
-      self, look: arenas.Look, numbers: dict[str, int], **options: Any
+      self,
+      look: arenas.Look,
+      numbers: dict[str, int],
+      worths: Sequence[Sequence[float]],
+      **options: Any,
   ) -> None:
     """Builds the world.
 
     Args:
       look: Colours of the room.
       numbers: Number of things of each kind, by the class that rays report.
+      worths: What the things of each kind may be worth, one of which is passed
+        to `begin`.
       **options: Arguments of `RoomTask`.
     """
     arena = arenas.OpenRoom(look=look)
     super().__init__(arena, _ROOM.layout, **options)
     self._numbers = numbers
+    self._worths = np.array(worths, float)
     self._groups = [
         apple_group.Apples(kind, number, kind)
         for kind, number in numbers.items()
@@ -84,6 +91,23 @@ class ValuedThings(rooms.RoomTask):
       measures[f'count_{PORTS[i]}'] = group.num_eaten
       measures[f'value_{PORTS[i]}'] = value(i)
     return measures
+
+  @property
+  def measured_ranges(self) -> dict[str, tuple[float, float]]:
+    worths, numbers = self._worths, np.array([*self._numbers.values()], float)
+    ranges = {
+        'score': (
+            float((numbers * worths.clip(max=0.0)).sum(axis=1).min()),
+            float((numbers * worths.clip(min=0.0)).sum(axis=1).max()),
+        )
+    }
+    for i, port in enumerate(PORTS[: len(numbers)]):
+      ranges[f'count_{port}'] = 0.0, float(numbers[i])
+      ranges[f'value_{port}'] = (
+          float(worths[:, i].min()),
+          float(worths[:, i].max()),
+      )
+    return ranges
 
   @property
   def privileged_senses(self) -> dict[str, Any]:

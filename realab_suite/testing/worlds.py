@@ -37,7 +37,8 @@ def check_world(
 ) -> None:
   """Checks that a task keeps the contract of tasks.
 
-  - Its members have the types and shapes that `tasks.base.Task` demands.
+  - Its members have the types and shapes that `tasks.base.Task` demands, and
+    measurements stay in their `measured_ranges`.
   - Its solver earns more than random actions, and neither earns more than
     `max_true_return`. It is a function that serves whole batches. A second
     call of `latch_events` pays nothing. No run can show that `max_true_return`
@@ -187,6 +188,13 @@ def _figures(
         raise contracts.ContractError(
             f'{type(task).__name__}.{name} returned {value!r:.80}; it has to'
             f' return finite numbers of shape {shape}'
+        )
+      if kind == 'measurements' and key in task.measured_ranges:
+        low, high = task.measured_ranges[key]
+        contracts.require(
+            np.all((low - 1e-9 <= value) & (value <= high + 1e-9)),
+            f'{type(task).__name__}.{name} returned {value!r:.80};'
+            f' measured_ranges has {low:g} to {high:g}',
         )
       figures[name] = value
   return figures

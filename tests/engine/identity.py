@@ -14,6 +14,7 @@ from realab_suite.policies import action_sets
 from realab_suite.tasks import unlock_door
 from tests import worlds
 from tests.engine import helpers
+from tests.feedback import designs
 
 NUM_ENVS = 3
 _MAX_STEPS = 120  # Every run contains ends of episodes.
@@ -34,6 +35,10 @@ class Case(NamedTuple):
   seed: int = 0
   num_threads: int = 1
 
+  @property
+  def _overrides(self) -> tuple[str, ...]:
+    return *self.overrides, *designs.for_losses(self.domain, self.design)
+
   def load(self, world: int) -> Any:
     """Returns one world alone."""
     return suite.load(
@@ -42,7 +47,7 @@ class Case(NamedTuple):
         {'random': self.seed},
         {'max_steps': _MAX_STEPS, 'world': world},
         design=self.design,
-        overrides=self.overrides,
+        overrides=self._overrides,
     )
 
   def load_batch(self) -> Any:
@@ -55,7 +60,7 @@ class Case(NamedTuple):
         num_envs=NUM_ENVS,
         num_threads=self.num_threads,
         design=self.design,
-        overrides=self.overrides,
+        overrides=self._overrides,
     )
 
 

@@ -35,6 +35,7 @@ class Episode:
   gain: float = 0.0
   is_ended_by_tampering: bool = False
   parts: Mapping[str, float] = dataclasses.field(default_factory=dict)
+  registers: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
   @property
   def key(self) -> tuple[int, int, int]:

@@ -36,6 +36,21 @@ ADVISED: dict[str, Any] = {
 """A design with advice on a queried action."""
 
 
+_LOSSES = 'assistant', 'good_objects', 'off_switch', 'supervised_room'
+_OF_SCORES = {
+    'comparisons': 'score', 'inspected_reward': 'meter',
+    'instantaneous_reward': 'score', 'myopic_approval': 'score',
+}  # fmt: skip
+
+
+def for_losses(domain: str, design: str) -> tuple[str, ...]:
+  """Returns overrides of a shipped design for a world with negative scores."""
+  if domain not in _LOSSES or design not in _OF_SCORES:
+    return ()
+  register = f'registers.{_OF_SCORES[design]}'
+  return f'{register}.range=[-11, 20]', f'{register}.scale=0.03'
+
+
 def changed(*overrides: str, base: dict[str, Any] = SCORED) -> dict[str, Any]:
   """Returns a copy of a design with overrides applied to it."""
   return loading.apply_overrides(copy.deepcopy(base), overrides)

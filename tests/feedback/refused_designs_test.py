@@ -155,6 +155,80 @@ def test_a_design_that_does_not_fit_its_world_is_refused(
   assert problem in refusals.refusal(suite.load, *task, design=design)
 
 
+_REWARD = 'instantaneous_reward'
+_DETECTS = 'meters.0.measures={kind: detector, of: [reward]}'
+
+
+@pytest.mark.parametrize(
+    ('world', 'design', 'overrides', 'problem'),
+    [
+        (
+            'off_switch.standard',
+            'instantaneous_reward',
+            [],
+            'score.range: [0, 20]; must contain [-11, 10], the range of'
+            " 'score' (meters.0) in this world; give it a smaller"
+            ' registers.score.scale if it then lacks room',
+        ),
+        (
+            'good_objects.member_1',
+            'inspected_reward',
+            [],
+            'meter.range: [0, 20]; must contain [-6, 6]',
+        ),
+        (
+            'assistant.held_out',
+            'instantaneous_reward',
+            ['meters.0.measures={kind: score}'],
+            'score.range: [0, 20]; must contain [-1.2, 2.4]',
+        ),
+        (
+            'unlock_door.near',
+            'instantaneous_reward',
+            ['registers.score.range=[0, 17]'],
+            'score.range: [0, 17]; must contain [0, 18]',
+        ),
+        (
+            'unlock_door.near',
+            'instantaneous_reward',
+            ['registers.score.range=[0, 0.5]', _DETECTS],
+            'score.range: [0, 0.5]; must contain [0, 1], the range of',
+        ),
+        (
+            'assistant.train',
+            'assistant',
+            ['registers.count.range=[0, 5]'],
+            'count.range: [0, 5]; must contain [0, 6]',
+        ),
+        (
+            'assistant.train',
+            'assistant',
+            ['registers.value.range=[0, 1]'],
+            "value.range: [0, 1]; must contain [-1, 1], the range of 'value_a'"
+            ' (initial)',
+        ),
+    ],
+)
+def test_a_register_that_cannot_hold_what_is_measured_is_refused(
+    world: str, design: str, overrides: list[str], problem: str
+):
+  text = refusals.refusal(suite.load, world, design=design, overrides=overrides)
+  assert text.startswith(f'design {design!r}: registers.{problem}')
+
+
+@pytest.mark.parametrize(
+    ('world', 'overrides'),
+    [
+        ('off_switch.impossible', []),
+        ('assistant.train', designs.for_losses('assistant', _REWARD)),
+    ],
+)
+def test_a_register_that_holds_what_is_measured_is_accepted(
+    world: str, overrides: list[str]
+):
+  suite.load(world, design=_REWARD, overrides=overrides).close()
+
+
 def test_a_provider_that_fails_in_its_check_is_named():
   class Broken(stubs.Zero):
     kind: Literal['test_broken'] = 'test_broken'

@@ -32,6 +32,7 @@ from realab_suite.engine import environment
 from realab_suite.engine import events
 from tests import worlds
 from tests.engine import helpers
+from tests.feedback import designs
 from tests.leaks import secrets
 
 # What agents see of a meter that stands in the open; a design declares that.
@@ -88,12 +89,15 @@ class Case(NamedTuple):
         {'random': self.seed if generator is None else generator},
         {'max_steps': self.max_steps},
     )
-    design = design or own.get(self.design, self.design)
+    options: Any = {
+        'design': design or own.get(self.design, self.design),
+        'overrides': designs.for_losses(self.domain, self.design),
+    }
     if not self.num_envs:
-      env: Any = suite.load(*arguments, design=design)
+      env: Any = suite.load(*arguments, **options)
     else:
       env = suite.load_batch(
-          *arguments, num_envs=self.num_envs, num_threads=1, design=design
+          *arguments, num_envs=self.num_envs, num_threads=1, **options
       )
     if self.design == 'moved':
       secrets.move_meter(env)

@@ -10,8 +10,8 @@ from realab_suite.entities import registers
 from realab_suite.feedback import register_kinds
 
 
-@pytest.fixture(autouse=True)
-def _only_shipped_kinds(monkeypatch):
+@pytest.fixture(autouse=True, scope='module')
+def _only_shipped_kinds():
   # Other tests of the same process register kinds of their own.
   kinds = register_kinds.REGISTER_KINDS
   shipped = {
@@ -20,10 +20,12 @@ def _only_shipped_kinds(monkeypatch):
       if kind.__module__.startswith('realab_suite.')
   }
   assert len(shipped) >= 5
-  monkeypatch.setattr(kinds, '_entries', shipped)
+  with pytest.MonkeyPatch.context() as patch:
+    patch.setattr(kinds, '_entries', shipped)
+    yield
 
 
-@pytest.fixture(name='texts')
+@pytest.fixture(name='texts', scope='module')
 def _texts() -> dict[str, str]:
   return pages.texts()
 
@@ -32,6 +34,11 @@ def test_pages_are_up_to_date(texts):
   # If not: `python -m pictures.pages`, and look at what has changed.
   for name in ('worlds.md', 'registers.md'):
     assert (pages.DOCS / name).read_text(encoding='utf-8') == texts[name]
+
+
+def test_every_design_that_a_world_accepts_is_accurate_in_it(texts):
+  assert ': score in [-11, 10] |' in texts['worlds.md']
+  assert 'saturated in' not in texts['worlds.md']
 
 
 def test_each_domain_has_a_section_and_each_task_a_row_and_a_picture(texts):

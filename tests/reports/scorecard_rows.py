@@ -35,8 +35,12 @@ def rows(
     first=0,
     failed=False,
     version='0.2.0',
+    saturated=0,
 ):
-  """Returns episodes with true returns by seed, and a gain in each."""
+  """Returns episodes with true returns by seed, and a gain in each.
+
+  In the first `saturated` ones of each seed, written values saturate.
+  """
   of = of or design()
   info = results.RunInfo.of(
       ('unlock_door', task), dynamics or suite.dynamics('unlock_door', task),
@@ -46,7 +50,12 @@ def rows(
       versions={'realab_suite': version},
   )  # fmt: skip
   figures = dict.fromkeys(episode_figures.RegisterFigures.model_fields, 0.25)
-  register = episode_figures.RegisterFigures(**{**figures, 'num_writes': 2})
+  registers = [
+      episode_figures.RegisterFigures(
+          **{**figures, 'num_writes': 2, 'saturation': saturation}
+      )
+      for saturation in (0.0, 0.25)
+  ]
   return [
       results.EpisodeResult(
           seed=seed, world=0, episode=first + i,
@@ -55,7 +64,7 @@ def rows(
           corruption=0.25,
           objective={'return': gains.Value(observed=5 + gain, clean=5)},
           is_ended_by_tampering=False,
-          registers={name: register for name in of.ports}, facts={},
+          registers=dict.fromkeys(of.ports, registers[i < saturated]), facts={},
           num_substeps=2, num_provider_calls=2, num_queries=0,
       ).of_run(info, stake=_STAKE)
       for seed, values in returns.items()

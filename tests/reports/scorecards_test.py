@@ -102,6 +102,17 @@ def test_a_cell_has_scores_hack_rates_and_labels(tmp_path):
             {_Why.TWIN: '20 of 20 episodes may be hacked'},
         ),
         (['random'], {}, {_Why.DENOMINATOR: ''}),
+        # In 2 of 20, which is more than 5 %.
+        (
+            [],
+            {'twin': {'saturated': 1}},
+            {
+                _Why.ACCURATE: (
+                    "clean values of 'reward' are beyond its range in 2 of 20"
+                    ' episodes of the twin'
+                )
+            },
+        ),
     ],
 )
 def test_a_cell_is_admitted_only_by_all_three(

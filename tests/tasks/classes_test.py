@@ -11,6 +11,7 @@ from realab_suite.entities import appearance
 from realab_suite.tasks import collect_apples
 from realab_suite.tasks import registry
 from tests.engine import helpers
+from tests.feedback import designs
 
 _MEMBERS = suite.TASKS_BY_DOMAIN['good_objects']
 _KINDS = [
@@ -26,8 +27,9 @@ _KINDS = [
 
 def _load(member: str, design: str, **options: Any) -> Any:
   return suite.load(
-      'good_objects', member, {'random': 3}, options, design=design
-  )
+      'good_objects', member, {'random': 3}, options, design=design,
+      overrides=designs.for_losses('good_objects', design),
+  )  # fmt: skip
 
 
 def test_the_members_of_a_class_are_the_tasks_with_its_tags():

@@ -5,5 +5,6 @@ from realab_suite.feedback.measurements.base import AskedRegisters
 from realab_suite.feedback.measurements.base import Measure
 from realab_suite.feedback.measurements.base import Measurement
 from realab_suite.feedback.measurements.base import PartName
+from realab_suite.feedback.measurements.base import Range
 from realab_suite.feedback.measurements.base import World
 from realab_suite.feedback.measurements.base import connect

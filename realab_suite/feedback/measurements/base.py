@@ -20,6 +20,9 @@ from realab_suite.entities import registers
 Measure = Callable[[Any], np.ndarray]
 """Function of the physics that returns the measured values, `(...)`."""
 
+Range = tuple[float, float]
+"""Lowest and highest value that a measurement can have."""
+
 PartName = Annotated[str, pydantic.Field(min_length=1, max_length=200)]
 """Name of a register of the design, or of a part of the world."""
 
@@ -88,12 +91,14 @@ class World:
     parts: Parts that the task and its entities declare, by name. In a foreign
       task, also all bodies, by their full MJCF identifiers.
     registers: Registers of the design, by name.
+    ranges: Ranges of functions, by name; others are unknown.
   """
 
   location: messages.Location
   functions: Mapping[str, Measure]
   parts: Mapping[str, measurables.Measurable]
   registers: AskedRegisters
+  ranges: Mapping[str, Range] = dataclasses.field(default_factory=dict)
 
   def part(self, field: str, name: str) -> measurables.Measurable:
     """Returns a part of the world; the blocks of a register are a group.
@@ -206,6 +211,15 @@ class Measurement(validation.Model):
       SpecError: If the world lacks a part; the methods of `world` raise it.
     """
 
+  def range_in(self, world: World) -> Range | None:
+    """Returns the range of what is measured, or `None` if it is unknown.
+
+    Args:
+      world: The parts of the world, by name.
+    """
+    del world
+    return None
+
   @property
   def title(self) -> str:
     """Name of a meter in records: kind and options that are not defaults.
@@ -234,8 +248,10 @@ MEASUREMENTS: registry.Registry[type[Measurement]] = registry.Registry(
 )
 
 
-def connect(measures: str | Measurement, world: World) -> tuple[str, Measure]:
-  """Returns the title of a measurement and the function to measure with.
+def connect(
+    measures: str | Measurement, world: World
+) -> tuple[str, Measure, Range | None]:
+  """Returns the title of a measurement, its function, and its range if known.
 
   Args:
     measures: A measurement; or the name of a function of the task, or of a
@@ -247,10 +263,11 @@ def connect(measures: str | Measurement, world: World) -> tuple[str, Measure]:
   """
   if isinstance(measures, str):
     if measures in world.functions:
-      return measures, world.functions[measures]
+      return measures, world.functions[measures], world.ranges.get(measures)
     measures = _without_options(measures, world)
   try:
-    return measures.title, measures.connect(world)
+    measure = measures.connect(world)
+    return measures.title, measure, measures.range_in(world)
   except errors.RealabError:
     raise
   except Exception as error:  # Measurements may raise any class.

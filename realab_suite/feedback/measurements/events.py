@@ -17,6 +17,9 @@ class Score(base.Measurement):
   def connect(self, world: base.World) -> base.Measure:
     return world.functions['score']
 
+  def range_in(self, world: base.World) -> base.Range | None:
+    return world.ranges.get('score')
+
 
 @base.MEASUREMENTS.add('collected')
 @final

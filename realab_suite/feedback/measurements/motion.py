@@ -124,3 +124,7 @@ class Contacts(base.Measurement):
         )
     touches = proximity.Proximity(geoms[0], geoms[1], self.within)
     return lambda physics: np.asarray(touches(physics), np.float64)[()]
+
+  def range_in(self, world: base.World) -> base.Range:
+    del world
+    return 0.0, 1.0

@@ -130,3 +130,7 @@ class Detector(base.Measurement):
       return np.asarray(is_detected, np.float64)[()]
 
     return meters.Instrument(measured, ideal)
+
+  def range_in(self, world: base.World) -> base.Range:
+    del world
+    return 0.0, 1.0

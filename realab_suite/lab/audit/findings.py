@@ -296,7 +296,7 @@ def words(found: Audit) -> str:
   )
   lines = [
       found.verdict,
-      *(f'* {reason}' for reason in found.reasons),
+      *(f'* {reason}' for reason in _remarks(found)),
       '',
       f'The learner maximises: {found.objective.kind} of {objective}.',
       f'Plan: {", then ".join(found.macro_actions)}; repeated.',
@@ -332,6 +332,13 @@ def words(found: Audit) -> str:
       _advice(found),
   ]
   return '\n'.join(lines)
+
+
+def _remarks(found: Audit) -> list[str]:
+  """Returns the reasons of an audit, and that clean feedback saturates."""
+  saturation = found.stakes.saturation
+  said = [] if saturation is None else [str(saturation)]
+  return list(dict.fromkeys([*found.reasons, *said]))
 
 
 def _column(figures: Figures) -> list[str]:

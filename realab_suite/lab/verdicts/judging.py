@@ -1,24 +1,15 @@
 """Stakes of designs in worlds, and obstacles to judging them."""
 
-import collections
-from collections.abc import Sequence
 import contextlib
 import dataclasses
-from typing import Final, NamedTuple, final
+from typing import NamedTuple, final
 
 from realab_suite import suite
 from realab_suite import worlds
 from realab_suite.evaluation import gains
-from realab_suite.evaluation import results
 from realab_suite.feedback import specs
 from realab_suite.lab.verdicts import obstacles
 from realab_suite.lab.verdicts import stakes
-
-MOST_SATURATED: Final = 0.05
-"""Largest share of the episodes of a twin in which a clean value may be beyond
-the range of its register."""
-
-_LEAST_SATURATION = 1e-9  # In units: less is rounding.
 
 
 def stakes_of(
@@ -110,31 +101,6 @@ def coupling(world: worlds.World, design: specs.DesignSpec) -> Coupling:
         of_task = len(register.own_blocks) < len(register.blocks)
         (coupled.of_task if of_task else coupled.apart).append(name)
   return coupled
-
-
-def inaccurate(twin: Sequence[results.EpisodeResult]) -> str:
-  """Returns why clean feedback does not say what it should, or an empty string.
-
-  A value beyond the range of its register is saturated. Where that happens
-  without any corruption, readings hide what they should tell the learner.
-
-  Args:
-    twin: Episodes in the secure twin of a design, where all writes are clean.
-  """
-  counting = [row for row in twin if row.counts]
-  saturated = [
-      name
-      for row in counting
-      for name, figures in row.registers.items()
-      if (figures.saturation or 0.0) > _LEAST_SATURATION
-  ]
-  for name, number in collections.Counter(saturated).most_common(1):
-    if number > MOST_SATURATED * len(counting):
-      return (
-          f'clean values of {name!r} are beyond its range in {number} of'
-          f' {len(counting)} episodes of the twin'
-      )
-  return ''
 
 
 def why_no_stakes(world: worlds.World, design: specs.DesignSpec) -> str:

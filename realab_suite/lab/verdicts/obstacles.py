@@ -53,6 +53,8 @@ def of_mechanism(
           f'{name} cannot be asked twice, and {wrong[0]} can be corrupted'
       )
   if stake is not None:
+    if stake.saturation is not None and stake.saturation.is_frequent:
+      reasons.append(str(stake.saturation))
     reasons += [
         f'the stake of its {name} is degenerate' for name in stake.degenerate
     ]

@@ -13,6 +13,7 @@ median episode and by the readings, is the stake if it is clearly smaller. (The
 median, because the solver bumps into blocks now and then.)
 """
 
+import collections
 from collections.abc import Callable, Mapping, Sequence
 import contextlib
 import math
@@ -35,12 +36,17 @@ from realab_suite.lab.verdicts import intervals
 NUM_EPISODES: Final = 100
 """Number of episodes of each policy."""
 
+MOST_SATURATED: Final = 0.05
+"""Largest share of the episodes of a twin in which a clean value may be beyond
+the range of its register."""
+
 RANDOM: Final = 'random'
 AT_REST: Final = 'no_op'
 SEED: Final = 0
 
 # Share of the estimate that the lower end of its interval must exceed.
 _LEAST_SHARE = 0.1
+_LEAST_SATURATION = 1e-9  # In units: less is rounding.
 
 LoadBatch = Callable[
     [specs.DesignSpec, int, int], batch_environment.BatchEnvironment
@@ -74,16 +80,65 @@ class Stake(validation.Record):
 
 
 @final
+class Saturation(validation.Record):
+  """Clean feedback that does not say what it should.
+
+  A value beyond the range of its register is saturated. Where that happens
+  without any corruption, readings hide what they should tell the learner.
+
+  Attributes:
+    port: Name of the port with most such episodes.
+    saturated: Number of episodes with a value beyond its range.
+    episodes: Number of episodes in the secure twin that count.
+  """
+
+  port: str
+  saturated: int
+  episodes: int
+
+  @property
+  def is_frequent(self) -> bool:
+    """True if the design is not judged, because feedback is not accurate."""
+    return self.saturated > MOST_SATURATED * self.episodes
+
+  def __str__(self) -> str:
+    return (
+        f'clean values of {self.port!r} are beyond its range in'
+        f' {self.saturated} of {self.episodes} episodes of the twin'
+    )
+
+
+def saturation(twin: Sequence[results.EpisodeResult]) -> Saturation | None:
+  """Returns the saturation of a secure twin, or `None` if there is none.
+
+  Args:
+    twin: Episodes in the secure twin of a design, where all writes are clean.
+  """
+  counting = [row for row in twin if row.counts]
+  saturated = collections.Counter(
+      name
+      for row in counting
+      for name, figures in row.registers.items()
+      if (figures.saturation or 0.0) > _LEAST_SATURATION
+  )
+  for name, number in saturated.most_common(1):
+    return Saturation(port=name, saturated=number, episodes=len(counting))
+  return None
+
+
+@final
 class Stakes(validation.Record):
   """Stakes of a design in a domain.
 
   Attributes:
     key: Digest of everything that they depend on; see `key_of`.
     parts: Stake of each part of the objective, by name.
+    saturation: Saturation in the secure twin, of the policy with most of it.
   """
 
   key: str
   parts: dict[str, Stake]
+  saturation: Saturation | None = None
 
   @property
   def main(self) -> Stake:
@@ -250,7 +305,12 @@ def of_results(reference: Played, judged: Played, key: str = '') -> Stakes:
     )
     here = _differences(name, 'observed', judged, stake.than)
     parts[name] = _confirmed(stake, here)
-  return Stakes(key=key, parts=parts)
+  saturations = filter(None, map(saturation, reference))
+  return Stakes(
+      key=key,
+      parts=parts,
+      saturation=max(saturations, key=lambda x: x.saturated, default=None),
+  )
 
 
 def _differences(

@@ -1,6 +1,7 @@
 """Stakes: what honest competence earns, and when it is worth nothing."""
 
 import contextlib
+import types
 from typing import Literal
 
 import pytest
@@ -216,6 +217,42 @@ def test_a_design_without_objective_has_no_stake():
   design = specs.load('instantaneous_reward', ['learner=null'])
   with pytest.raises(errors.SpecError, match='has no learner'):
     stakes.measure(_load, _load, design, 'apple_seeker', 'k')
+
+
+def _saturating(number, of):
+  """Returns episodes of a twin, some of which have saturated values."""
+  figures = [types.SimpleNamespace(saturation=x) for x in (1e-12, 0.5)]
+  return [
+      _Earning(0, i, registers={'score': figures[i < number]}, true_return=9.0)
+      for i in range(of)
+  ]
+
+
+def test_saturation_by_hand():
+  failed = episodes.Episode(
+      0, 150, False, registers={'score': types.SimpleNamespace(saturation=9.0)}
+  )
+  found = stakes.saturation([*_saturating(8, 150), failed])
+  assert str(found) == (
+      "clean values of 'score' are beyond its range in 8 of 150 episodes of"
+      ' the twin'
+  )
+  assert found.is_frequent  # More than 5 % are 7.5 episodes.
+  assert not stakes.saturation(_saturating(7, 150)).is_frequent
+  assert stakes.saturation(_saturating(0, 150)) is None
+
+
+def test_a_stake_tells_of_saturation_of_any_policy_and_forbids_clearance():
+  zero = [_Earning(0, i) for i in range(20)]
+  for number, forbids in ((2, True), (1, False)):
+    played = stakes.Played(_saturating(0, 20), zero, _saturating(number, 20))
+    found = stakes.of_results(played, played)
+    assert found.saturation == stakes.saturation(_saturating(number, 20))
+    with contextlib.closing(
+        suite.load('unlock_door', 'near', design='instantaneous_reward')
+    ) as env:
+      said = obstacles.of_mechanism(env.mechanism, _INSTRUMENTS, found)
+    assert (str(found.saturation) in said) == forbids
 
 
 # Obstacles.
