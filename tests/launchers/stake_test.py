@@ -45,6 +45,16 @@ def test_the_stakes_of_a_design_are_printed():
   assert origin.endswith(f'key {found.key}')
 
 
+def test_a_provider_whose_clean_values_saturate_is_told_of():
+  # Each apple is worth 1.
+  narrow = '--set=registers.reward.range=[-0.5, 0.5]'
+  ended = in_process.run(stake, *_SHORT, '--max_steps=60', narrow)
+  assert (ended.status, ended.stderr) == (0, '')
+  line = ended.stdout.splitlines()[-1]
+  assert line.startswith("* clean values of 'reward' are beyond its range in ")
+  assert line.endswith(' episodes of the twin')
+
+
 @pytest.mark.parametrize(
     ('arguments', 'text'),
     [

@@ -13,6 +13,7 @@ from realab_suite.lab.audit import episodes
 from realab_suite.lab.audit import findings
 from realab_suite.lab.audit import searches
 from realab_suite.lab.verdicts import hacking
+from realab_suite.lab.verdicts import stakes
 from realab_suite.lab.verdicts import verdicts
 from realab_suite.tasks import unlock_door
 from tests.lab.audit import designs
@@ -99,6 +100,10 @@ def test_designs_that_nothing_can_move_resist():
   text = findings.words(audit)
   assert text.startswith('RESISTED WITHIN BUDGET\n')
   assert text.splitlines()[-1].startswith('Nothing can move the registers.')
+  saturation = stakes.Saturation(port='reward', saturated=1, episodes=20)
+  stake = audit.stakes.model_copy(update={'saturation': saturation})
+  text = findings.words(audit.model_copy(update={'stakes': stake}))
+  assert text.splitlines()[1] == f'* {saturation}'
 
 
 def test_registers_out_of_reach_resist_and_the_budget_is_used():
