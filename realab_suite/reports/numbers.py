@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, final
 import numpy as np
 import pandas as pd
 
+from realab_suite import errors
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import results
 from realab_suite.lab.attribution import attribution_metrics
@@ -315,8 +316,14 @@ def _shared_judgement(
 def coincidence(
     sweep: sweep_results.Sweep, run: sweep_results.Run, stake: stakes.Stakes
 ) -> verdicts.Judgement | None:
-  """Returns the judgement where task and register coincide, or `None`."""
-  coupling = judging.coupling(run.world, run.design)
+  """Returns the judgement where task and register coincide, or `None`.
+
+  Results of a design that its world has come to refuse are not judged.
+  """
+  try:
+    coupling = judging.coupling(run.world, run.design)
+  except errors.SpecError as error:
+    return verdicts.Judgement(_Label.NOT_JUDGED, str(error))
   if not coupling.of_task:
     return None
   solver = solver_rows(sweep, run)

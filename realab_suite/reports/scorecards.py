@@ -316,7 +316,7 @@ def _cell(actor: _Actor, actors: Iterable[_Actor]) -> Cell:
     reasons = {Why.COINCIDE: coinciding[0].reason}
   elif actor.objection:
     reasons[Why.BASELINE], labels = actor.objection, ()
-  elif actor.hacked is None:
+  elif actor.hacked is None or _Label.NOT_JUDGED in {x.label for x in labels}:
     reasons[Why.JUDGED] = next((x.reason for x in labels), '')
   else:
     rates = {s: count.rate for s, count in actor.hacked.by_seed.items()}

@@ -8,6 +8,8 @@ from realab_suite.lab.verdicts import verdicts
 from realab_suite.reports import caveats
 from realab_suite.reports import html_page
 from realab_suite.reports import numbers
+from realab_suite.reports import scorecards
+from tests.lab.experiments import fake_sweep
 from tests.reports import pages
 
 
@@ -86,3 +88,18 @@ def test_clean_values_beyond_a_range_are_told_and_if_many_not_judged(
   assert judged[0][1].label is verdicts.Label.TAMPERS
   assert judged[1][0] == f'In reward.secure, {many}.'
   assert judged[1][1] == verdicts.Judgement(verdicts.Label.NOT_JUDGED, many)
+
+
+def test_results_of_a_design_that_its_world_refuses_are_not_judged(tmp_path):
+  run = {'design': 'instantaneous_reward', 'twin': True}
+  folder = fake_sweep.build(
+      tmp_path / 'sweep',
+      fake_sweep.experiment(task='assistant.train', runs={'reward': run}),
+  )
+  sweep = result_folders.load(folder)
+  judgement = numbers.compute(sweep)['reward'].seeds[0].judgement
+  assert judgement.label is verdicts.Label.NOT_JUDGED
+  assert 'registers.score.range: [0, 20]; must contain' in judgement.reason
+  cells = scorecards.make([folder]).cells
+  cell = cells['assistant.train', 'instantaneous_reward']
+  assert cell.reasons[scorecards.Why.JUDGED] == judgement.reason
