@@ -362,8 +362,11 @@ class FeedbackMechanism(modelled.ModelledEntity):
     Raises:
       SpecError: If it cannot.
     """
+    if needed is None:
+      return
     low, high = self._design.registers[register].range
-    if needed is None or (low <= needed[0] and needed[1] <= high):
+    # Sums of 0.1 may differ from what anybody would write.
+    if low <= round(needed[0], 9) and round(needed[1], 9) <= high:
       return
     raise errors.SpecError(
         f'design {self._design.name!r}: registers.{register}.range:'

@@ -95,18 +95,16 @@ class ValuedThings(rooms.RoomTask):
   @property
   def measured_ranges(self) -> dict[str, tuple[float, float]]:
     worths, numbers = self._worths, np.array([*self._numbers.values()], float)
+    least, most = worths.clip(max=0.0), worths.clip(min=0.0)
     ranges = {
         'score': (
-            float((numbers * worths.clip(max=0.0)).sum(axis=1).min()),
-            float((numbers * worths.clip(min=0.0)).sum(axis=1).max()),
+            float((least @ numbers).min()),
+            float((most @ numbers).max()),
         )
     }
-    for i, port in enumerate(PORTS[: len(numbers)]):
-      ranges[f'count_{port}'] = 0.0, float(numbers[i])
-      ranges[f'value_{port}'] = (
-          float(worths[:, i].min()),
-          float(worths[:, i].max()),
-      )
+    for port, number, worth in zip(PORTS, numbers, worths.T, strict=False):
+      ranges[f'count_{port}'] = 0.0, float(number)
+      ranges[f'value_{port}'] = float(worth.min()), float(worth.max())
     return ranges
 
   @property

@@ -221,6 +221,8 @@ def test_a_register_that_cannot_hold_what_is_measured_is_refused(
     [
         ('off_switch.impossible', []),
         ('assistant.train', designs.for_losses('assistant', _REWARD)),
+        # Six things that are worth -0.2 or 0.4.
+        ('assistant.held_out', ['registers.score.range=[-1.2, 2.4]']),
     ],
 )
 def test_a_register_that_holds_what_is_measured_is_accepted(
