@@ -333,8 +333,9 @@ def draw(found: Sequence[Entry]) -> figure.Figure:
 def _mark(
     axes: Any, y: float, value: intervals.Interval, colour: str, marker: str
 ) -> None:
-  """Draws a figure and its interval, if it has one."""
+  """Draws a figure and its interval, or the seeds in its place."""
   axes.plot([value.low, value.high], [y, y], color=colour, linewidth=1.5)
+  axes.plot(value.seeds, [y] * len(value.seeds), '|', color=colour)
   axes.plot(value.estimate, y, marker, color=colour, clip_on=False)
 
 

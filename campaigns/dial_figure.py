@@ -7,7 +7,8 @@ experiment `dial`:
     python -m campaigns.dial_figure results/dial docs/images/dial.png
 
 Each panel has the share of the crates that are base blocks of registers on its
-axis. Bars are 95 % intervals over seeds.
+axis. Bars are 95 % intervals over seeds; hack rates of fewer than five seeds
+have none.
 """
 
 import csv

@@ -1,13 +1,13 @@
 """Campaign C43: intervals on synthetic data cover what they say.
 
-Run from the root of the repository, about four minutes:
+Run from the root of the repository, about ten minutes:
 
     python -m campaigns.statistics_campaign [scale] [seed]
 
 Prints `name figure target verdict seed` for each figure. Then compares other
 intervals in the same samples: a line with the coverage of each, and its mean
-width next to that of Student's interval. The rates of false labels, and their
-power, are in `false_alarm_campaign`.
+width next to that of Student's interval. Rates of false labels and verdicts,
+and their power, are in `verdicts_campaign`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -21,6 +21,7 @@ from scipy import stats
 
 from campaigns import figure_lines
 from realab_suite.lab.verdicts import intervals
+from realab_suite.lab.verdicts import scores
 
 SEEDS = 10
 EPISODES = 5
@@ -32,6 +33,12 @@ TOP = 18.0
 # Seeds and episodes of the samples of other intervals, and their resamples.
 _COMPARED = ((3, 1), (3, 5), (5, 1), (5, 5), (10, 1), (10, 5), (20, 5))
 _RESAMPLES = 1_999
+# Seeds of samples of hack rates, and episodes of each.
+_RATE_SEEDS = (1, 3, 5, 10)
+_RATE_EPISODES = (20, 100)
+# Worlds of scorecards, and seeds in each.
+_CARD_WORLDS = (2, 5, 10)
+_CARD_SEEDS = (3, 5)
 # Number of draws to compute means without a formula.
 _MANY = 100_000
 
@@ -132,6 +139,54 @@ DATA: Mapping[str, Data] = {
 }
 
 
+@final
+@dataclasses.dataclass(frozen=True)
+class Rates:
+  """Seeds of two kinds, as to their hack rates.
+
+  Attributes:
+    share: Share of seeds of the first kind.
+    first: Hack rate of the first kind.
+    second: Hack rate of the second kind.
+  """
+
+  share: float
+  first: float = 0.95
+  second: float = 0.02
+
+  @property
+  def mean(self) -> float:
+    """The true mean."""
+    return self.share * self.first + (1 - self.share) * self.second
+
+  def draw(
+      self, rng: np.random.Generator, seeds: int, episodes: int
+  ) -> np.ndarray:
+    """Returns the share of hacked episodes of each seed, `(seeds,)`."""
+    is_first = rng.random(seeds) < self.share
+    rates = np.where(is_first, self.first, self.second)
+    return rng.binomial(episodes, rates) / episodes
+
+
+RATES: Mapping[str, Rates] = {
+    **{f'{p:.0%} of seeds hack': Rates(p) for p in (0.1, 0.3, 0.5, 0.8)},
+    '0.2 % in all seeds': Rates(1.0, first=0.002),
+    'all or none, 10 %': Rates(0.1, 1.0, 0.0),
+}
+
+# Scores of seeds, (worlds, seeds).
+SCORES: Mapping[str, Callable[[np.random.Generator, int, int], np.ndarray]] = {
+    'normal': lambda r, w, n: r.normal(size=(w, n)),
+    'different spreads': lambda r, w, n: (
+        r.normal(size=(w, n)) * (1 + np.arange(w)[:, np.newaxis] % 3)
+    ),
+    'exponential': lambda r, w, n: r.exponential(size=(w, n)) - 1,
+    'two kinds': lambda r, w, n: (
+        (r.random((w, n)) < 0.3) - 0.3 + r.normal(0, 0.03, (w, n))
+    ),
+}
+
+
 def by_seed(values: np.ndarray) -> dict[int, list[float]]:
   """Returns the rows of [seed, episode] under the number of their seed."""
   return dict(enumerate(values.tolist()))
@@ -183,6 +238,81 @@ def coverage_of_difference(
       for _ in range(repetitions)
   ]
   return _coverage(found, 0.75 * data.mean)
+
+
+def _of_episodes(rates: Sequence[float], episodes: int) -> intervals.Interval:
+  """Interval of Clopper and Pearson, as if all episodes were alike."""
+  number = episodes * len(rates)
+  test = stats.binomtest(round(episodes * sum(rates)), number)
+  low, high = test.proportion_ci()
+  return intervals.Interval(test.statistic, low, high, 0.95, 1, number)
+
+
+RATE_INTERVALS: Mapping[
+    str, Callable[[list[float], int], intervals.Interval]
+] = {
+    'Gaffke': lambda rates, _: intervals.mean_rate(rates),
+    'Hall': lambda rates, _: intervals.mean_interval(
+        {seed: [rate] for seed, rate in enumerate(rates)},
+        bounds=intervals.SHARE,
+    ),
+    'episodes': _of_episodes,
+}
+
+
+def coverage_of_rate(
+    rates: Rates,
+    repetitions: int,
+    rng: np.random.Generator,
+    seeds: int,
+    episodes: int = 100,
+) -> dict[str, tuple[float, float]]:
+  """Returns coverage, and samples without an interval, by the interval."""
+  by_kind: dict[str, list[intervals.Interval]] = {x: [] for x in RATE_INTERVALS}
+  for _ in range(repetitions):
+    sample = rates.draw(rng, seeds, episodes).tolist()
+    for name, interval in RATE_INTERVALS.items():
+      by_kind[name].append(interval(sample, episodes))
+  return {name: _coverage(x, rates.mean) for name, x in by_kind.items()}
+
+
+def _report_rates(
+    lines: figure_lines.Lines, repetitions: int, rng: np.random.Generator
+) -> None:
+  for name, rates in RATES.items():
+    for seeds in _RATE_SEEDS:
+      for episodes in _RATE_EPISODES:
+        where = f'{name}, {seeds} seeds of {episodes}'
+        by_kind = coverage_of_rate(rates, repetitions, rng, seeds, episodes)
+        covered, absent = by_kind.pop('Gaffke')
+        if absent < 1:
+          lines.at_least(f'coverage of hack rate, {where}', covered, 0.9)
+        if absent:
+          lines.at_most(f'seeds in place of hack rate, {where}', absent, 1)
+        others = (f'{kind} {x:.3f}' for kind, (x, _) in by_kind.items())
+        print(f'{where}: {", ".join(others)}', flush=True)
+
+
+def _report_scores(
+    lines: figure_lines.Lines, repetitions: int, rng: np.random.Generator
+) -> None:
+  """Means of scorecards, whose true scores are 0 in all worlds."""
+  for name, draw in SCORES.items():
+    for worlds in _CARD_WORLDS:
+      for seeds in _CARD_SEEDS:
+        means = []
+        for _ in range(repetitions // 2):
+          sample = draw(rng, worlds, seeds).tolist()
+          aggregates = scores.aggregate(
+              {str(i): values for i, values in enumerate(sample)}
+          )
+          means += aggregates[:1] if aggregates else ()
+        covered, _ = _coverage(means, 0.0)
+        where = f'{name}, {worlds} worlds of {seeds} seeds'
+        # Three seeds of two kinds are often alike.
+        is_hard = name == 'two kinds' and worlds == 2 and seeds == 3
+        least = 0.75 if is_hard else 0.88 if name == 'exponential' else 0.9
+        lines.at_least(f'coverage of scorecard, {where}', covered, least)
 
 
 def _coverage(
@@ -317,6 +447,8 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
   lines = figure_lines.Lines('C43', seed)
   repetitions = max(1, round(scale * _REPETITIONS))
   _report_intervals(lines, repetitions, np.random.default_rng(seed))
+  _report_rates(lines, repetitions, np.random.default_rng(seed))
+  _report_scores(lines, repetitions, np.random.default_rng(seed))
   compare(repetitions, np.random.default_rng(seed))
   return lines.num_missed
 

@@ -28,7 +28,8 @@ _RETURNS_NOTE = (
     ' reading minus clean content. Episodes that the agent gave up count with'
     ' their figures up to that point, so the mean true return is a lower bound'
     ' ("at least"). Failed episodes do not count. "(all 5 seeds)" means that'
-    ' all seeds have the same value, so there is no interval.'
+    ' all seeds have the same value, so there is no interval. Of fewer than'
+    ' five seeds, "5 (0, 3, 12)" are their hack rates, after the mean.'
 )
 _SEEDS_NOTE = (
     'The label of a seed describes one trained agent; the verdict on a design'

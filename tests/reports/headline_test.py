@@ -65,7 +65,7 @@ def test_the_first_lines_come_in_their_order(five):
   )
   assert label == ('Tampers in 5 of 5 seeds. Verdict: tampers in 5 of 5 seeds.')
   assert rate == (
-      'Hack rate 100 % (all 5 seeds), beside 0 % of reward.transplant.'
+      'Hack rate 100.0 % [47.8, 100.0], beside 0 % of reward.transplant.'
   )
   assert audit == 'Audit: not audited.'
   training_of = figures['reward'].training

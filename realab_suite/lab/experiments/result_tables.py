@@ -369,15 +369,20 @@ def counts(summary: comparison.RunSummary) -> dict[str, int]:
 
 def ends(
     summary: comparison.RunSummary, hacked: hacking.Hacking | None
-) -> dict[str, float | None]:
+) -> dict[str, tables.Figure]:
   """Returns figures with intervals, by their columns in a CSV file."""
-  return tables.ends(
-      {
-          'true_return': summary.true_return,
-          'observed_return': summary.observed_return,
-          'hack_rate': hacked and hacked.rate,
-          'hack_free_return': hacked and hacked.hack_free_return,
-          'relative_gain': hacked and hacked.relative_gain,
-          'corruption_metres': summary.corruption,
-      }
-  )
+  of_seeds = hacked.by_seed if hacked else {}
+  rates = {seed: count.rate for seed, count in of_seeds.items()}
+  return {
+      **tables.ends(
+          {
+              'true_return': summary.true_return,
+              'observed_return': summary.observed_return,
+              'hack_rate': hacked and hacked.rate,
+              'hack_free_return': hacked and hacked.hack_free_return,
+              'relative_gain': hacked and hacked.relative_gain,
+              'corruption_metres': summary.corruption,
+          }
+      ),
+      'hack_rates_by_seed': tables.by_seed(rates) or None,
+  }

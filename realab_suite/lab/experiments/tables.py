@@ -82,7 +82,7 @@ def text(figure: Figure) -> str:
       return str(figure)
     case float():
       return intervals.short(_without_noise(figure))
-  if math.isnan(figure.low):
+  if math.isnan(figure.low) and not figure.seeds:
     return text(figure.estimate)
   estimate, low, high = (
       _without_noise(value)
@@ -126,9 +126,21 @@ def csv_text(records: Iterable[Mapping[str, Any]]) -> str:
 def ends(
     figures: Mapping[str, intervals.Interval | None],
 ) -> dict[str, float | None]:
-  """Returns intervals as columns of a CSV file: each estimate and its ends."""
+  """Returns intervals as columns of a CSV file: each estimate and its ends.
+
+  Ends in whose place seeds are printed are unknown.
+  """
   return {
-      f'{name}{suffix}': interval and getattr(interval, end)
+      f'{name}{suffix}': (
+          getattr(interval, end)
+          if interval and not (suffix and interval.seeds)
+          else None
+      )
       for name, interval in figures.items()
       for suffix, end in (('', 'estimate'), ('_low', 'low'), ('_high', 'high'))
   }
+
+
+def by_seed(values: Mapping[int, float]) -> str:
+  """Returns a figure of each seed as a cell of a CSV file."""
+  return '; '.join(f'{seed}: {value:.6g}' for seed, value in values.items())

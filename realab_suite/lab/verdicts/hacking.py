@@ -303,15 +303,12 @@ def hacking(
   counting = [one for one in episodes if one.counts]
   if not counting:
     return None
-  is_hacked: dict[int, list[float]] = {}
   relative: dict[int, list[float]] = {}
   free = []
   for row, gain in zip(counting, _relative_gains(counting, stake), strict=True):
-    hacked = _is_hacked(row, stake, beside.limit)
-    is_hacked.setdefault(row.seed, []).append(float(hacked))
     known_gain = 0.0 if math.isnan(gain) else gain
     relative.setdefault(row.seed, []).append(known_gain)
-    if not hacked:
+    if not _is_hacked(row, stake, beside.limit):
       free.append(row)
   hack_free_return = None
   if free:
@@ -322,7 +319,7 @@ def hacking(
   counts = count_by_seed(counting, stake, beside.limit)
   return Hacking(
       control=beside,
-      rate=intervals.mean_interval(is_hacked, bounds=intervals.SHARE),
+      rate=intervals.mean_rate([seed.rate for seed in counts.values()]),
       hack_free_return=hack_free_return,
       by_seed=counts,
       count=total(counts.values()),

@@ -12,12 +12,16 @@ import math
 from typing import final
 
 import numpy as np
+from scipy import interpolate
+from scipy import optimize
 from scipy import special
 
 from realab_suite import errors
 
 # Relative distance by which rounding may move a value across a bound.
 _ROUNDING = 1e-9
+# Smallest number of seeds whose mean hack rate has an interval.
+_FEWEST_SEEDS = 5
 
 Bounds = tuple[float | None, float | None]
 """Smallest and largest possible value; `None` if unbounded."""
@@ -40,6 +44,7 @@ class Interval:
     num_seeds: Number of seeds.
     num_values: Number of episodes of all seeds.
     bounds: Range of possible values. Printed numbers stay within it as well.
+    seeds: Values of the seeds, if they are printed in place of the ends.
   """
 
   estimate: float
@@ -49,6 +54,7 @@ class Interval:
   num_seeds: int
   num_values: int
   bounds: Bounds = UNBOUNDED
+  seeds: Sequence[float] = ()
 
   def scaled(self, factor: float) -> 'Interval':
     """Returns the interval in another unit.
@@ -65,9 +71,14 @@ class Interval:
         low=factor * self.low,
         high=factor * self.high,
         bounds=(low, high),
+        seeds=[factor * value for value in self.seeds],
     )
 
   def __str__(self) -> str:
+    if self.seeds:
+      seeds = ', '.join(map(short, self.seeds))
+      seeds = '1 seed' if self.num_seeds == 1 else seeds
+      return f'{short(self.estimate)} ({seeds})'
     half_width = (self.high - self.low) / 2
     if math.isnan(half_width):
       return f'{short(self.estimate)} [nan, nan]'
@@ -161,6 +172,48 @@ def mean_interval(
   return interval(
       min(max(low, least), estimate), max(min(high, most), estimate)
   )
+
+
+def mean_rate(rates: Sequence[float]) -> Interval:
+  """Returns the mean hack rate of seeds.
+
+  Seeds are of kinds, of which one hacks in all episodes and another in none,
+  and five seeds may well be of one. The interval, at level 0.95, is that of
+  Gaffke (2005), "Three test statistics for a nonparametric one-sided hypothesis
+  on the mean of a nonnegative variable", Math. Methods Stat. 14(4). It holds
+  whatever the kinds; for rates of 0 and 1, it is that of Clopper and Pearson.
+  Fewer than five seeds are printed in its place, unless they are equal.
+
+  Args:
+    rates: Hack rate of each seed; each counts as one value.
+  """
+  estimate, low, high = mean(np.asarray(rates)), math.nan, math.nan
+  level, number, seeds = 0.95, len(rates), sorted(rates)
+  if number >= _FEWEST_SEEDS or (number > 1 and seeds[0] == seeds[-1]):
+    chance, seeds = (1 + level) / 2, []
+    low = 1 - _largest_mean([1 - rate for rate in rates], chance)
+    high = _largest_mean(rates, chance)
+  return Interval(estimate, low, high, level, number, number, SHARE, seeds)
+
+
+def _largest_mean(rates: Sequence[float], chance: float) -> float:
+  """Returns the upper bound of a mean that holds with a given chance.
+
+  It is a quantile of the mean of the rates and 1 with uniform random weights.
+  The density of this mean is a B-spline whose knots are these values (Curry and
+  Schoenberg, 1966).
+  """
+  knots = np.sort([*rates, 1.0])
+  least, width = knots[0], 1 - knots[0]
+  if not width:
+    return 1.0
+  integral = interpolate.BSpline.basis_element(knots).antiderivative()
+
+  def excess(bound: float) -> float:
+    share = (integral(bound) - integral(least)) * len(rates) / width
+    return float(share) - chance
+
+  return float(optimize.brentq(excess, least, math.nextafter(1, 0)))
 
 
 def percent(share: float) -> str:

@@ -1,5 +1,7 @@
 """Tests of the writer of tables."""
 
+import pytest
+
 from realab_suite.lab.experiments import tables
 from realab_suite.lab.verdicts import intervals
 
@@ -30,6 +32,14 @@ def test_unknown_figures_are_empty_in_csv_files_and_others_exact():
       'c,,2.50,,0.5,True,,,,,,',
       ',,,,,,0.3333333333333333,nan,nan,,,',
   ]
+
+
+def test_ends_are_empty_where_seeds_are_printed():
+  rate = intervals.mean_rate([0.12, 0.0, 0.03])
+  assert tables.ends({'rate': rate}) == {
+      'rate': pytest.approx(0.05), 'rate_low': None, 'rate_high': None
+  }  # fmt: skip
+  assert tables.by_seed({7: 0.12, 3: 0.0}) == '7: 0.12; 3: 0'
 
 
 def test_a_table_without_rows_has_its_columns():

@@ -11,6 +11,7 @@ from scipy import stats
 
 from campaigns import statistics_campaign
 from realab_suite import errors
+from realab_suite.lab.experiments import tables
 from realab_suite.lab.verdicts import intervals
 
 
@@ -124,6 +125,49 @@ class TestMeanInterval:
       assert transformed == pytest.approx(expected, rel=1e-9)
 
 
+class TestMeanRate:
+
+  @pytest.mark.parametrize(
+      ('rates', 'text'),
+      [
+          ([0.12, 0.0, 0.03], '5 (0, 3, 12)'),
+          ([0.5, 0.0], '25 (0, 50)'),
+          ([0.002, 0.0, 0.0, 0.002], '0.1 (0, 0, 0.2, 0.2)'),
+          ([0.07], '7 (1 seed)'),
+          ([0.0], '0 (1 seed)'),
+          ([0.0, 0.0, 0.0], '0.0 [0.0, 70.8]'),
+          ([1.0, 1.0], '100.0 [15.8, 100.0]'),
+          ([0.98, 1.0, 1.0, 1.0, 1.0], '99.6 [47.6, 100.0]'),
+      ],
+  )
+  def test_fewer_than_five_seeds_are_printed_unless_they_are_equal(
+      self, rates, text
+  ):
+    found = intervals.mean_rate(rates).scaled(100)
+    assert tables.text(found) == text
+    assert math.isnan(found.low) == math.isnan(found.high) == ('(' in text)
+
+  @pytest.mark.parametrize('rates', [[0] * 3, [0] * 5, [0, 1] * 5, [1] * 300])
+  def test_rates_of_0_and_1_have_the_interval_of_clopper_and_pearson(
+      self, rates
+  ):
+    found = intervals.mean_rate(rates)
+    expected = stats.binomtest(sum(rates), len(rates)).proportion_ci()
+    assert _ends(found)[1:] == pytest.approx(tuple(expected), abs=1e-9)
+
+  def test_the_ends_are_quantiles_over_random_weights(self):
+    rates = np.array([0.01, 0.02, 0.02, 0.3, 0.95, 1.0])
+    found = intervals.mean_rate(rates[::-1])
+    weights = np.random.default_rng(0).dirichlet(np.ones(7), 400_000)
+    for end, values, level in (
+        (found.low, [0, *rates], 0.025),
+        (found.high, [*rates, 1], 0.975),
+    ):
+      assert end == pytest.approx(
+          np.quantile(weights @ values, level), abs=2e-3
+      )
+
+
 def _seeds(low, high):
   """Returns values of one to eight seeds of one to four episodes."""
   value = strategies.floats(low, high, allow_subnormal=False)
@@ -214,3 +258,14 @@ class TestCoverage:
     difference, _ = statistics_campaign.coverage_of_difference(data, 300, rng)
     assert 0.9 <= mean
     assert 0.89 <= difference
+
+  @pytest.mark.parametrize('seeds', [3, 5])
+  @pytest.mark.parametrize('rates', statistics_campaign.RATES)
+  def test_intervals_of_hack_rates_cover_kinds_that_are_rare(
+      self, rates, seeds
+  ):
+    found = statistics_campaign.coverage_of_rate(
+        statistics_campaign.RATES[rates], 300, np.random.default_rng(0), seeds
+    )
+    covered, absent = found['Gaffke']
+    assert 0.9 <= covered or absent == 1
