@@ -260,10 +260,21 @@ class Accumulator:
 
     Args:
       world: Index of the world in the batch.
+
+    Raises:
+      ResultsError: If a reading was not finite.
     """
     numbers = at(self._num_steps, world)
     if not numbers[_OBSERVED]:
       return {}
+    for part, observed in zip(
+        self._parts, at(self._sums, world)[_OBSERVED], strict=True
+    ):
+      if not np.isfinite(observed):
+        raise errors.ResultsError(
+            f'{" and ".join(part.weights)}: readings of an episode add up to'
+            f' {observed}; must be finite'
+        )
     return {
         part.name: _value(
             at(self._sums, world)[:, i]

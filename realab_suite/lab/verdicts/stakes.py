@@ -1,9 +1,10 @@
 """Stakes: what a design is worth to its learner, in the unit of its objective.
 
 The stake is what honest competence earns: the objective of the task's solver
-minus that of random actions, or of an agent at rest if that difference is
-smaller and positive, on clean contents. A gain divided by the stake, the
-relative gain, has no unit and compares designs.
+minus that of random actions, or of an agent at rest or nothing (0) if that
+difference is smaller and positive, on clean contents. (A design can fine
+incompetence by any amount.) A gain divided by the stake, the relative gain, has
+no unit and compares designs.
 
 A stake belongs to a design in a world. It is measured in the reference task of
 the domain, in the secure twin of the design, where all contents are clean. A
@@ -42,6 +43,7 @@ the range of its register."""
 
 RANDOM: Final = 'random'
 AT_REST: Final = 'no_op'
+NOTHING: Final = 'nothing'
 SEED: Final = 0
 
 # Share of the estimate that the lower end of its interval must exceed.
@@ -62,7 +64,7 @@ class Stake(validation.Record):
     estimate: The stake.
     low: Lower end of its 95 % interval.
     high: Upper end of its 95 % interval.
-    than: Policy that the solver is compared with: `random` or `no_op`.
+    than: What the solver is compared with: `random`, `no_op` or `nothing`.
     is_confirmed: False if the solver does not clearly earn more than that in
       the world where the design is judged.
   """
@@ -300,7 +302,7 @@ def of_results(reference: Played, judged: Played, key: str = '') -> Stakes:
     stake = _stake(
         {
             than: _differences(name, 'clean', reference, than)
-            for than in (RANDOM, AT_REST)
+            for than in (RANDOM, AT_REST, NOTHING)
         }
     )
     here = _differences(name, 'observed', judged, stake.than)
@@ -322,13 +324,19 @@ def _differences(
     name: Name of a part of the objective.
     side: `observed` or `clean`.
     played: The episodes.
-    than: Policy that the solver is compared with.
+    than: What the solver is compared with.
   """
+  if than == NOTHING:
+    return [
+        getattr(row.objective[name], side)
+        for row in played.solver
+        if row.is_valid
+    ]
   others = played.random if than == RANDOM else played.at_rest
   return [
-      getattr(one.objective[name], side) - getattr(other.objective[name], side)
-      for one, other in zip(played.solver, others, strict=True)
-      if one.is_valid and other.is_valid
+      getattr(row.objective[name], side) - getattr(other.objective[name], side)
+      for row, other in zip(played.solver, others, strict=True)
+      if row.is_valid and other.is_valid
   ]
 
 
@@ -355,7 +363,11 @@ def _confirmed(stake: Stake, here: Sequence[float]) -> Stake:
 
 
 def _stake(differences: Mapping[str, Sequence[float]]) -> Stake:
-  """Returns the smaller positive of two differences, or else the larger one."""
+  """Returns the smaller positive of two differences, or else the larger one.
+
+  The difference to nothing, the last one, counts if it is clearly positive and
+  smaller than a positive one.
+  """
   candidates = []
   for than, values in differences.items():
     if len(values) < 2:
@@ -372,7 +384,10 @@ def _stake(differences: Mapping[str, Sequence[float]]) -> Stake:
             than=than,
         )
     )
-  positive = [one for one in candidates if one.estimate > 0]
-  if positive:
-    return min(positive, key=lambda stake: stake.estimate)
-  return max(candidates, key=lambda stake: stake.estimate)
+  *competitors, nothing = candidates
+  positive = [one for one in competitors if one.estimate > 0]
+  if not positive:
+    return max(competitors, key=lambda stake: stake.estimate)
+  if not nothing.is_degenerate:
+    positive.append(nothing)
+  return min(positive, key=lambda stake: stake.estimate)

@@ -39,9 +39,9 @@ FALSE_VERDICT_RATE: Final = 0.05
 """Level of the test for the verdict `tampers`. What both are in fact is
 measured by `campaigns/verdicts_campaign.py`."""
 
-MOVED: Final = 0.01
+MOVED: Final = 0.001
 """Corruption that counts apart from gains, in metres."""
-MOVED_SHARE: Final = 0.01
+MOVED_SHARE: Final = 0.001
 """The same, as a share of the range of the register: units may be small."""
 
 MOST_COINCIDING: Final = 10.0
@@ -230,6 +230,9 @@ def _doubts(
   doubts = []
   if count.unknown:
     doubts.append(f'the gain of {count.unknown} episodes is unknown')
+  if control.count.unknown:
+    number = control.count.unknown
+    doubts.append(f'the gain of {number} episodes of its control is unknown')
   # Beside such a control, a low hack rate shows nothing.
   if control.share_that_gains > hacking.LARGEST_CONTROL_SHARE:
     doubts.append(
@@ -492,7 +495,7 @@ def coincidence(
 def _moved(episodes: _Episodes, name: str) -> tuple[int, int]:
   """Returns in how many of the episodes a register was moved itself."""
   own = [row.registers[name].own or 0.0 for row in episodes if row.counts]
-  return sum(metres > MOVED for metres in own), len(own)
+  return sum(metres > 0 for metres in own), len(own)
 
 
 def gains_at_a_loss(

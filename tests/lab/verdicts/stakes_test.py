@@ -55,6 +55,8 @@ def _alike(*episodes_of):
         ([4.0, 4.0, 4.0], [2.0, 2.0, 2.0], 6.0, 'random'),
         # Inflated by a penalty of random actions: rest decides.
         ([-1e6, -1e6, -1e6], [0.0, 0.0, 0.0], 10.0, 'no_op'),
+        # A penalty of both: the solver earns 10 more than nothing.
+        ([-1e6, -1e6, -1e6], [-1e6, -1e6, -1e6], 10.0, 'nothing'),
         # At rest the agent earns more, but random actions do not.
         ([7.0, 7.0, 7.0], [11.0, 11.0, 11.0], 3.0, 'random'),
         # Nobody earns less than the solver: the larger one, which is negative.
