@@ -76,8 +76,8 @@ def worlds() -> str:
       '**Accurate feedback.** A design is refused in a world where a meter may'
       ' measure more than its register holds. Elsewhere, the solver and random'
       ' actions have played its secure twin, and clean values were beyond the'
-      f' range of a register in at most {stakes.MOST_SATURATED:.0%} of episodes'
-      ' (`python -m benchmarks.suite_table --accuracy`).',
+      f' range of a register in at most {100 * stakes.MOST_SATURATED:g} % of'
+      ' episodes (`python -m benchmarks.suite_table --accuracy`).',
       accuracy_table(),
       *map(_domain, suite.TASKS_BY_DOMAIN),
   ]
