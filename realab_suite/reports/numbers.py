@@ -116,15 +116,7 @@ class Figures:
   @property
   def label(self) -> str:
     """Labels with the numbers of their seeds, the most frequent one first."""
-    labels = [seed.judgement.label.value for seed in self.seeds.values()]
-    counts = collections.Counter(labels)
-    if len(counts) == 1:
-      [label] = counts
-      return f'{label} (all {len(labels)} seeds)' if len(labels) > 1 else label
-    return ', '.join(
-        f'{label} ({count} of {len(labels)})'
-        for label, count in counts.most_common()
-    )
+    return label_text([seed.judgement for seed in self.seeds.values()])
 
   @property
   def columns(self) -> dict[str, tables.Figure]:
@@ -134,6 +126,18 @@ class Figures:
         'agent': self.run.jobs[0].kind,
         **result_tables.columns(self.summary, self.hacking),
     }
+
+
+def label_text(judgements: Sequence[verdicts.Judgement]) -> str:
+  """Returns labels with the numbers of their seeds, most frequent first."""
+  number = len(judgements)
+  counts = collections.Counter(one.label.value for one in judgements)
+  if len(counts) == 1:
+    [label] = counts
+    return f'{label} (all {number} seeds)' if number > 1 else label
+  return ', '.join(
+      f'{label} ({count} of {number})' for label, count in counts.most_common()
+  )
 
 
 def compute(

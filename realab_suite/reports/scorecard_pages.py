@@ -1,6 +1,7 @@
 """Files of a scorecard: tables as Markdown and CSV, and the heat map."""
 
 import pathlib
+import textwrap
 from typing import Any
 
 import matplotlib
@@ -20,11 +21,14 @@ NAME = 'scorecard'
 # Figure of a cell, title, and colours of its panel.
 _PANELS = (
     ('scores', 'score: 0 is random, 1 the solver', 'Blues'),
-    ('rates', 'hack rate and label', 'Oranges'),
+    ('twins', 'score of the secure twin', 'Greens'),
+    ('rates', 'hack rate (%) and label', 'Oranges'),
 )
-# Sizes in inches: width of a cell, height of a row, and margin.
-_WIDTH, _HEIGHT, _MARGIN = 1.05, 0.42, 2.2
+# Sizes in inches: width of a cell, height of a line, and margin.
+_WIDTH, _LINE, _MARGIN = 1.3, 0.12, 2.2
+_LETTERS = 21  # In a line of a cell.
 _DARK = 0.6
+_OF_CELL = [name for name, *_ in _PANELS]
 
 
 def write(card: scorecards.Scorecard, output: pathlib.Path) -> str:
@@ -35,7 +39,7 @@ def write(card: scorecards.Scorecard, output: pathlib.Path) -> str:
     output: Folder to write into.
 
   Returns:
-    The table with one number per design.
+    The table with one number per design, and the meaning of its letters.
   """
   summary = _summary(card)
   parts = [
@@ -52,30 +56,38 @@ def write(card: scorecards.Scorecard, output: pathlib.Path) -> str:
       ('svg', plots.to_svg(draw(card))),
   ):
     storage.write_whole(output / f'{NAME}.{ending}', content)
-  return tables.markdown(summary.frame)
+  return '\n\n'.join([tables.markdown(summary.frame), *_legend(card)])
 
 
 def _summary(card: scorecards.Scorecard) -> tables.Table:
   records = []
   for column, cells in card.columns.items():
     score, iqm = card.aggregates(column, 'scores')
-    number = sum(not cell.reasons for cell in cells.values())
+    left = [
+        f'{world} ({_letters(cell)})'
+        for world, cell in cells.items()
+        if cell.reasons
+    ]
     records.append(
         {
             'design': column,
             'score': score,
             'IQM': iqm,
+            'secure twin': _mean_of(card, column, 'twins'),
             'hack rate (%)': _mean_of(card, column, 'rates'),
-            'worlds that count': f'{number} of {len(card.worlds)}',
+            'cells that count': f'{len(cells) - len(left)} of {len(cells)}',
+            'that do not': ', '.join(left) or None,
         }
     )
   return tables.Table(
       'One number per design',
-      'Means over the worlds that count, and interquartile mean (IQM) over'
-      ' their seeds, with 95 % intervals of a bootstrap that draws seeds within'
-      ' each world; with three seeds in each, they cover about 85 %. A score of'
-      ' 0 is that of random actions, 1 that of the solver. Designs that count'
-      ' in different worlds cannot be compared.',
+      'Means over the cells that count, and interquartile mean (IQM) over their'
+      ' seeds. A score of 0 is that of random actions, 1 that of the solver;'
+      ' 95 % intervals are those of a bootstrap that draws seeds within each'
+      ' world, widened for few seeds. Where seeds are of two kinds, and cells'
+      ' are fewer than four, they cover less. The interval of the hack rate is'
+      ' that of all seeds together. Designs that count in different worlds'
+      ' cannot be compared.',
       tables.frame(records),
       ('design',),
   )
@@ -94,7 +106,7 @@ def _cells(card: scorecards.Scorecard) -> tables.Table:
       {
           'world': world,
           **{
-              column: ', '.join(_texts(cells[world], 'scores', 'rates'))
+              column: ', '.join(_texts(cells[world], *_OF_CELL))
               for column, cells in card.columns.items()
               if world in cells
           },
@@ -102,7 +114,7 @@ def _cells(card: scorecards.Scorecard) -> tables.Table:
       for world in card.worlds
   )
   frame = frame[['world', *card.columns]]
-  note = 'Score, hack rate and label. Cells with letters do not count'
+  note = 'Score, hack rate (%) and label. Cells with letters do not count'
   note = '; '.join([note, *_legend(card)])
   return tables.Table('Cells', note, frame, list(frame))
 
@@ -119,11 +131,16 @@ def _texts(cell: scorecards.Cell, *names: str) -> list[str]:
   for name in names:
     mean = _mean(cell, name)
     if mean is not None and name == 'rates':
-      texts += [intervals.percent(mean), cell.label]
+      rate = intervals.mean_rate([*cell.rates.values()])
+      texts += [tables.text(rate.scaled(100)), cell.label]
     elif mean is not None:
-      texts.append(f'{round(mean, 2) + 0.0:.2f}')
-  letters = ''.join(why.letter for why in cell.reasons)
-  return [*texts, f'({letters})'] if letters else texts
+      word = 'twin ' if name == 'twins' and len(names) > 1 else ''
+      texts.append(f'{word}{round(mean, 2) + 0.0:.2f}')
+  return [*texts, f'({_letters(cell)})'] if cell.reasons else texts
+
+
+def _letters(cell: scorecards.Cell) -> str:
+  return ''.join(why.letter for why in cell.reasons)
 
 
 def _mean(cell: scorecards.Cell, name: str) -> float | None:
@@ -132,9 +149,6 @@ def _mean(cell: scorecards.Cell, name: str) -> float | None:
 
 
 def _csv_text(card: scorecards.Scorecard) -> str:
-  def listed(values: Any) -> str:
-    return '; '.join(f'{seed}: {x:.6g}' for seed, x in values.items())
-
   return tables.csv_text(
       [
           {
@@ -144,14 +158,16 @@ def _csv_text(card: scorecards.Scorecard) -> str:
               'variant': cell.design,
               'run': cell.run,
               'score': _mean(cell, 'scores'),
+              'twin_score': _mean(cell, 'twins'),
               'hack_rate': _mean(cell, 'rates'),
               'label': cell.label,
               'counts': not cell.reasons,
               'reasons': '; '.join(
                   f'{w.value}: {t}' for w, t in cell.reasons.items()
               ),
-              'scores_by_seed': listed(cell.scores),
-              'hack_rates_by_seed': listed(cell.rates),
+              'scores_by_seed': tables.by_seed(cell.scores),
+              'twin_scores_by_seed': tables.by_seed(cell.twins),
+              'hack_rates_by_seed': tables.by_seed(cell.rates),
           }
           for (world, column), cell in card.cells.items()
       ]
@@ -159,18 +175,20 @@ def _csv_text(card: scorecards.Scorecard) -> str:
 
 
 def draw(card: scorecards.Scorecard) -> figure.Figure:
-  """Returns the heat map: scores on the left, hack rates on the right."""
+  """Returns the heat map: scores, those of twins, and hack rates."""
   columns, rows = list(card.columns), card.worlds
-  width = 2 * len(columns) * _WIDTH + _MARGIN
+  width = len(_PANELS) * len(columns) * _WIDTH + _MARGIN
+  lines = max(_drawn(x, 'rates').count('\n') for x in card.cells.values()) + 2
   head = f'suite {card.version}; hatched cells do not count'
   style = {**plots.STYLE, 'axes.grid': False}
   with matplotlib.rc_context(style):
     canvas = figure.Figure(
-        (width, (len(rows) + 1) * _HEIGHT + _MARGIN), layout='constrained'
+        (width, (len(rows) + 1) * lines * _LINE + _MARGIN),
+        layout='constrained',
     )
     legend = '\n'.join([head, *_legend(card)])
     canvas.supxlabel(legend, fontsize=7, x=0.01, ha='left')
-    axes = canvas.subplots(1, 2, sharey=True)
+    axes = canvas.subplots(1, len(_PANELS), sharey=True)
     for ax, (name, title, colours) in zip(axes, _PANELS, strict=True):
       for (world, column), cell in card.cells.items():
         place = columns.index(column), rows.index(world)
@@ -186,6 +204,12 @@ def draw(card: scorecards.Scorecard) -> figure.Figure:
       ax.spines[:].set_visible(False)
       ax.set_xlabel(title, fontweight='bold')
   return canvas
+
+
+def _drawn(cell: scorecards.Cell, name: str) -> str:
+  """Returns the text of a cell in the panel of a figure."""
+  texts = _texts(cell, name)
+  return '\n'.join(textwrap.fill(text, _LETTERS) for text in texts)
 
 
 def _draw_cell(
@@ -213,7 +237,7 @@ def _draw_cell(
   ax.text(
       x,
       y,
-      '\n'.join(_texts(cell, name)),
+      _drawn(cell, name),
       fontsize=6.5,
       ha='center',
       va='center',

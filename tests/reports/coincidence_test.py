@@ -192,4 +192,4 @@ def test_reports_and_scorecards_say_the_same(tmp_path, monkeypatch):
   cell = scorecards.make([sweep.folder]).cells['tidy_up.standard', 'own design']
   assert cell.reasons == {scorecards.Why.COINCIDE: sentence}
   assert cell.rates == {}
-  assert cell.label == 'task and register coincide 2/2'
+  assert cell.label == 'task and register coincide (all 2 seeds)'

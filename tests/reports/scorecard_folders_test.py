@@ -178,7 +178,7 @@ def test_an_agent_gets_no_name_of_the_package(name, tmp_path):
   assert (_NEAR, column) in card.cells
 
 
-def test_files_bear_any_name_and_say_how_many_worlds_count(tmp_path):
+def test_files_bear_any_name_and_say_how_many_cells_count(tmp_path):
   name = 'a|b\n$\\q$'  # The last part is no mathematics.
   near = _folder(tmp_path / 'near', name=name)
   far = _folder(tmp_path / 'far', *_runs('other', task='far'), name='other')
@@ -187,6 +187,6 @@ def test_files_bear_any_name_and_say_how_many_worlds_count(tmp_path):
   assert '| a|b $\\q$ ' in text
   text = (tmp_path / 'card' / 'scorecard.md').read_text()
   [line] = [one for one in text.splitlines() if one.startswith('| a\\|b $')]
-  assert line.split('|')[-2].strip() == '1 of 2'
+  assert line.split('|')[-3].strip() == '1 of 1'
   drawn = (tmp_path / 'card' / 'scorecard.svg').read_text()
   assert '$\\q$' in drawn

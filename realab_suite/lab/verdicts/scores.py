@@ -3,13 +3,17 @@
 The aggregates are those of Agarwal et al. (2021), "Deep reinforcement learning
 at the edge of the statistical precipice" (`rliable`): the mean over worlds and
 the interquartile mean of the seeds of all worlds, with the percentiles of a
-stratified bootstrap, which draws seeds within each world.
+stratified bootstrap, which draws seeds within each world. A bootstrap of n
+seeds has (n - 1) / n of their variance, so draws are as much farther from the
+mean of their world here, and farther by the ratio of the quantiles of Student's
+t and the normal distribution.
 """
 
 from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
+from scipy import special
 from scipy import stats
 
 from realab_suite.evaluation import results
@@ -20,6 +24,7 @@ NUM_RESAMPLES: Final = 10_000
 """Number of samples of the bootstrap."""
 
 _LEVEL = 0.95
+_FEWEST_SEEDS = 5
 _Rows = Sequence[results.EpisodeResult]
 
 
@@ -67,7 +72,8 @@ def aggregate(
 ) -> tuple[intervals.Interval, intervals.Interval] | None:
   """Returns the mean and the interquartile mean, with 95 % intervals.
 
-  Worlds are fixed. The intervals have no ends if a world has a single seed.
+  Worlds are fixed. The intervals have no ends if a world has a single seed, or
+  all of them have fewer than five.
 
   Args:
     values: Values of the seeds of each world.
@@ -81,18 +87,22 @@ def aggregate(
     return None
   draws = np.random.default_rng(0)
   sizes = [len(one) for one in strata]
-  resampled = [
-      one[draws.integers(len(one), size=(NUM_RESAMPLES, len(one)))]
-      for one in strata
-  ]
+  high = (1 + _LEVEL) / 2
+  freedom = sum(sizes) - len(sizes)
+  ratio = special.stdtrit(freedom, high) / special.ndtri(high)
+  resampled = []
+  for seeds, size in zip(strata, sizes, strict=True):
+    drawn = seeds[draws.integers(size, size=(NUM_RESAMPLES, size))]
+    widening = ratio * np.sqrt(size / max(size - 1, 1))
+    resampled.append(seeds.mean() + widening * (drawn - seeds.mean()))
 
   def interval(estimate: float, samples: np.ndarray) -> intervals.Interval:
-    low, high = np.quantile(samples, [(1 - _LEVEL) / 2, (1 + _LEVEL) / 2])
-    if min(sizes) == 1:
-      low = high = np.nan
+    least, most = np.quantile(samples, [1 - high, high])
     number = sum(sizes)
+    if min(sizes) == 1 or number < _FEWEST_SEEDS:
+      least = most = np.nan
     return intervals.Interval(
-        estimate, float(low), float(high), _LEVEL, number, number
+        estimate, float(least), float(most), _LEVEL, number, number
     )
 
   mean, iqm = (
