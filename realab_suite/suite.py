@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping, Sequence
 import contextlib
 import dataclasses
-from importlib import resources
 from typing import TYPE_CHECKING, Any, final
 import warnings
 
@@ -12,6 +11,7 @@ import mujoco
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.config import documents
 from realab_suite.config import integers
 from realab_suite.config import loading
 from realab_suite.config import messages
@@ -175,7 +175,7 @@ def dynamics(domain_name: str, task_name: str) -> tuple[int, str | None]:
     UnknownNameError: If there is no such task.
   """
   factory = registry.find(domain_name, task_name)
-  golden = resources.files('realab_suite.configs') / 'golden.yaml'
+  golden = documents.folder_of_configs() / 'golden.yaml'
   recorded = loading.parse_yaml(golden.read_bytes(), 'golden.yaml')
   digests = recorded.get(mujoco.__version__, {})
   # Building a task takes longer than reading an attribute of its class.

@@ -26,7 +26,9 @@ _PACKAGE = 'realab_suite'
 
 # What each layer may import besides itself and `_FOUNDATION`. An entry that
 # names a module admits that module alone.
-_FOUNDATION = ('archive', 'errors', 'trees', '_display', '_versions')
+_FOUNDATION = (
+    'archive', 'errors', 'trees', 'sources', '_display', '_versions',
+)  # fmt: skip
 _BELOW_SUITE = (
     'config', 'configs', 'entities', 'policies', 'feedback', 'tasks', 'engine',
     'evaluation',
@@ -41,6 +43,7 @@ _MAY_IMPORT = {
     'archive': (),
     'errors': (),
     'trees': (),
+    'sources': (),
     '_display': (),
     '_versions': (),
     'configs': (),

@@ -2,12 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 import copy
-from importlib import resources
-from importlib.resources import abc
+import functools
 import os
+import pathlib
 from typing import Any, Generic, TypeVar, final
 
 from realab_suite import errors
+from realab_suite import sources
 from realab_suite.config import loading
 from realab_suite.config import messages
 from realab_suite.config import validation
@@ -17,14 +18,34 @@ _Spec = TypeVar('_Spec', bound=validation.Spec)
 Source = str | os.PathLike[str] | Mapping[str, Any]
 
 
-def shipped(folder: str, ending: str) -> dict[str, abc.Traversable]:
+@functools.cache
+def folder_of_configs() -> pathlib.Path:
+  """Returns the folder of the files that belong to the code: beside it.
+
+  Another checkout may be installed, so `realab_suite.configs` may be its files.
+
+  Raises:
+    SpecError: If the code has no such folder.
+  """
+  package = sources.FOLDER
+  folders = package / 'configs', package.parent / 'configs'
+  for folder in folders:
+    if (folder / 'golden.yaml').is_file():
+      return folder
+  raise errors.SpecError(
+      f'{package}: this code has no designs; they must be in'
+      f' {" or ".join(map(str, folders))}'
+  )
+
+
+def shipped(folder: str, ending: str) -> dict[str, pathlib.Path]:
   """Returns the files that are part of the package, by their names.
 
   Args:
-    folder: Folder in `realab_suite.configs`.
+    folder: Name of a folder of `folder_of_configs`.
     ending: Ending of the files, which is no part of their names.
   """
-  files = (resources.files('realab_suite.configs') / folder).iterdir()
+  files = (folder_of_configs() / folder).iterdir()
   return {
       file.name.removesuffix(ending): file
       for file in sorted(files, key=lambda file: file.name)
@@ -46,7 +67,7 @@ class Documents(Generic[_Spec]):
     Args:
       what: Kind of the files, for messages: 'design'.
       model: Class of their specs, with a field `name`.
-      folder: Folder in `realab_suite.configs`.
+      folder: Name of a folder of `folder_of_configs`.
     """
     self._what = what
     self._model = model

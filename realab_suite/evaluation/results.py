@@ -13,6 +13,7 @@ import pydantic
 
 from realab_suite import _versions
 from realab_suite import errors
+from realab_suite import sources
 from realab_suite.config import validation
 from realab_suite.engine import events
 from realab_suite.evaluation import endings
@@ -210,9 +211,13 @@ class EpisodeResult(validation.Record):
 
 
 def versions() -> dict[str, str]:
-  """Returns the versions of the packages that results depend on, by name."""
+  """Returns the versions of what results depend on, by name.
+
+  They are those of packages, and `code`, the digest of the sources.
+  """
   return {
       'realab_suite': _versions.VERSION,
+      'code': sources.digest(),
       'python': platform.python_version(),
       **{
           name: metadata.version(name)

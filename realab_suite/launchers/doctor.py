@@ -10,6 +10,8 @@ from importlib import metadata
 import os
 import platform
 
+from realab_suite import sources
+from realab_suite.config import documents
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
 
@@ -70,6 +72,10 @@ def main() -> int:
     0 if the core works, otherwise 1.
   """
   program.say(versions())
+  designs = documents.folder_of_configs()
+  _tell(
+      'code', f'{sources.digest()}, of {sources.FOLDER}; designs of {designs}'
+  )
   core = renderers.problem_of(_STEPS_A_WORLD, 'step', os.environ)
   if core:
     _tell('core', f'cannot step a world: {core}', _CORE_REMEDY)

@@ -18,6 +18,7 @@ import pytest
 
 import realab_suite
 from realab_suite import errors
+from realab_suite import sources
 from realab_suite.engine import events
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import results
@@ -162,6 +163,7 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path, content):
 def test_a_row_names_the_versions_that_it_depends_on():
   assert results.versions() == {
       'realab_suite': realab_suite.__version__,
+      'code': sources.digest(),
       'python': platform.python_version(),
       'dm-control': results.metadata.version('dm-control'),
       'mujoco': mujoco.__version__,
