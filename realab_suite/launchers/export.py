@@ -15,7 +15,14 @@ from absl import flags as absl_flags
 from realab_suite.launchers import flags
 from realab_suite.launchers import program
 
-flags.take(flags.IMPORT, flags.INPUT, flags.OUTPUT, flags.RUN, flags.EPISODES)
+flags.take(
+    flags.IMPORT,
+    flags.INPUT,
+    flags.ACCEPT_OTHER_CODE,
+    flags.OUTPUT,
+    flags.RUN,
+    flags.EPISODES,
+)
 
 _FORMAT = absl_flags.DEFINE_string(
     'format', 'parquet', "Format of the agent's data: parquet or minari."
@@ -34,7 +41,9 @@ def main() -> None:
   from realab_suite.lab.experiments import result_folders
 
   export.check(_FORMAT.value, output)
-  run = flags.find_run(result_folders.load(folder).runs)
+  run = flags.find_run(
+      result_folders.load(folder, flags.ACCEPT_OTHER_CODE.value).runs
+  )
   export.export(
       sources.of_run(run, flags.num_episodes()),
       output,

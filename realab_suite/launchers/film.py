@@ -14,7 +14,9 @@ from realab_suite.launchers import flags
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
 
-flags.take(flags.IMPORT, flags.INPUT, flags.RUN, flags.VIDEO)
+flags.take(
+    flags.IMPORT, flags.INPUT, flags.ACCEPT_OTHER_CODE, flags.RUN, flags.VIDEO
+)
 
 
 def main() -> None:
@@ -30,7 +32,9 @@ def main() -> None:
   from realab_suite.reports import films
 
   flags.load_imports()
-  run = flags.find_run(result_folders.load(folder).runs)
+  run = flags.find_run(
+      result_folders.load(folder, flags.ACCEPT_OTHER_CODE.value).runs
+  )
   row = replays.typical_row(run)
   if row is None:
     raise errors.ResultsError(f'{folder}: run {name} has no valid episode yet')

@@ -8,11 +8,13 @@ from collections.abc import Mapping
 import functools
 import importlib
 import re
+import sys
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from absl import flags
 
 from realab_suite import errors
+from realab_suite import sources
 from realab_suite.config import loading
 from realab_suite.config import messages
 from realab_suite.config import task_names
@@ -37,6 +39,13 @@ _integer = functools.partial(flags.DEFINE_integer, flag_values=_SHARED)
 
 IMPORT = _strings(
     'import', [], 'Module with parts of your own to import; may be repeated.'
+)
+ACCEPT_OTHER_CODE = flags.DEFINE_boolean(
+    'accept_other_code',
+    False,
+    'Accepts that results of different code are mixed. A learner never'
+    ' continues on other code.',
+    flag_values=_SHARED,
 )
 INPUT = _string('input', None, 'Folder of a sweep, or of published results.')
 OUTPUT = _string(
@@ -162,6 +171,7 @@ def load_imports() -> None:
   Raises:
     SpecError: If a module cannot be found.
   """
+  loaded = set(sys.modules)
   for name in IMPORT.value:
     try:
       importlib.import_module(name)
@@ -170,6 +180,7 @@ def load_imports() -> None:
           f'--import={name:.80}: {error}; must be a module in the working'
           ' directory or an installed one; for several, repeat the option'
       ) from error
+  sources.use(IMPORT.value, sys.modules.keys() - loaded)
 
 
 def import_arguments() -> list[str]:

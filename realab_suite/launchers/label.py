@@ -27,6 +27,7 @@ flags.take(
     *flags.SCRIPTED,
     flags.IMPORT,
     flags.INPUT,
+    flags.ACCEPT_OTHER_CODE,
     flags.OUTPUT,
 )
 _DESIGNS = absl_flags.DEFINE_list(
@@ -63,7 +64,8 @@ def _of_sweep() -> list[Any]:
 
   if not flags.INPUT.value:
     return []
-  runs = result_folders.load(pathlib.Path(flags.INPUT.value)).runs
+  folder = pathlib.Path(flags.INPUT.value)
+  runs = result_folders.load(folder, flags.ACCEPT_OTHER_CODE.value).runs
   number = flags.num_episodes()
   return [sources.of_run(run, number) for run in runs.values()]
 

@@ -14,7 +14,7 @@ from realab_suite.lab.experiments import requirements
 from realab_suite.launchers import flags
 from realab_suite.launchers import program
 
-flags.take(flags.IMPORT, flags.INPUT, flags.OUTPUT)
+flags.take(flags.IMPORT, flags.INPUT, flags.OUTPUT, flags.ACCEPT_OTHER_CODE)
 
 
 def main() -> None:
@@ -28,7 +28,9 @@ def main() -> None:
 
   folder_name = flags.OUTPUT.value
   output = pathlib.Path(folder_name) if folder_name else folder
-  path = html_page.write(folder, output, program.say)
+  path = html_page.write(
+      folder, output, program.say, flags.ACCEPT_OTHER_CODE.value
+  )
   program.say(f'The report is {path}')
 
 

@@ -8,7 +8,7 @@ its flags, and then writes scorecard.md, .csv and .svg into the folder.
 With --input instead of --experiment, nothing is run:
 
   python -m realab_suite.launchers.scorecard --output=results/card \
-    --input=docs/results/suite,results/my_agent
+    --input=docs/results/suite,results/my_agent --accept_other_code
 """
 
 import pathlib
@@ -47,7 +47,7 @@ def main() -> None:
   from realab_suite.reports import scorecard_pages
   from realab_suite.reports import scorecards
 
-  card = scorecards.make(inputs)
+  card = scorecards.make(inputs, flags.ACCEPT_OTHER_CODE.value)
   output = pathlib.Path(flags.OUTPUT.value or inputs[0])
   program.say(scorecard_pages.write(card, output))
   program.say(f'The scorecard of suite {card.version} is in {output}')

@@ -16,7 +16,9 @@ from realab_suite.lab.experiments import threads
 from realab_suite.launchers import flags
 from realab_suite.launchers import program
 
-flags.take(flags.IMPORT, flags.EXPERIMENT, flags.OUTPUT)
+flags.take(
+    flags.IMPORT, flags.EXPERIMENT, flags.OUTPUT, flags.ACCEPT_OTHER_CODE
+)
 
 _ON_TASK = absl_flags.DEFINE_string(
     'on_task',
@@ -85,6 +87,7 @@ def main() -> None:
       only=only,
       calibration=_CALIBRATION.value,
       arguments=flags.import_arguments(),
+      accept_other_code=flags.ACCEPT_OTHER_CODE.value,
   )
 
 

@@ -11,6 +11,7 @@ import pathlib
 
 from absl import flags as absl_flags
 
+from realab_suite import errors
 from realab_suite.lab.experiments import threads
 from realab_suite.launchers import flags
 from realab_suite.launchers import program
@@ -21,10 +22,17 @@ flags.take(
     flags.RUN,
     flags.SEED,
     flags.OUTPUT,
+    flags.ACCEPT_OTHER_CODE,
 )
 
 _PARENT = absl_flags.DEFINE_integer(
     'parent', None, 'Process whose end also ends the run; used by sweeps.'
+)
+_CODE = absl_flags.DEFINE_string(
+    'code', None, 'Digest of the sources of the sweep; used by sweeps.'
+)
+_PLANNED = absl_flags.DEFINE_string(
+    'planned', None, 'Name of the folder of the run; used by sweeps.'
 )
 
 
@@ -42,10 +50,21 @@ def main() -> None:
   from realab_suite.lab.experiments import jobs
   from realab_suite.lab.experiments import training
 
-  [job] = jobs.plan(experiment_specs.load(name), [flags.SEED.value], [run])
+  experiment, folder = experiment_specs.load(name), pathlib.Path(output)
+  [job] = jobs.plan(experiment, [flags.SEED.value], [run])
   training.check_learners([job], name)
-  options = training.Options(program.say, _PARENT.value)
-  training.run(job, pathlib.Path(output), options)
+  if _PLANNED.value not in (None, job.folder()):
+    raise errors.ResultsError(
+        f'{folder}: {_PLANNED.value} was planned, and {job.folder()} would be'
+        ' run; a file that the design names, or a version, is another one here'
+        ' than in the sweep; start the sweep again'
+    )
+  seeds = *experiment.seeds, *experiment.calibration_seeds
+  is_accepted = flags.ACCEPT_OTHER_CODE.value
+  planned = jobs.plan(experiment, seeds)
+  jobs.check_codes([job, *planned], folder, is_accepted, _CODE.value)
+  options = training.Options(program.say, _PARENT.value, is_accepted)
+  training.run(job, folder, options)
 
 
 if __name__ == '__main__':

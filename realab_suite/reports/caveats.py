@@ -39,6 +39,8 @@ def _on_completeness(
         'These are calibration seeds, which were used to choose settings. Do'
         ' not report them as results.'
     )
+  if len(sweep.codes) > 1:
+    yield f'Different code made the results: {", ".join(sorted(sweep.codes))}.'
   if sweep.unfinished:
     seeds_of_run: dict[str, list[str]] = {}
     for job in sweep.unfinished:

@@ -23,7 +23,10 @@ SEEDS_CSV = 'seeds.csv'
 
 
 def write(
-    folder: pathlib.Path, output: pathlib.Path, say: Callable[[str], None]
+    folder: pathlib.Path,
+    output: pathlib.Path,
+    say: Callable[[str], None],
+    accept_other_code: bool = False,
 ) -> pathlib.Path:
   """Writes the report of a sweep.
 
@@ -31,6 +34,7 @@ def write(
     folder: Folder of the sweep.
     output: Folder to write into.
     say: Called with a line on each step of the work.
+    accept_other_code: True to accept results of different code.
 
   Returns:
     The path of the page.
@@ -39,7 +43,7 @@ def write(
     ResultsError: If the folder does not contain a sweep, a file in it is
       damaged, a design or world is unknown, or the output cannot be written.
   """
-  sweep = result_folders.load(folder)
+  sweep = result_folders.load(folder, accept_other_code)
   figures = numbers.compute(sweep, say)
   page_tables = report_tables.page_tables(figures)
   lines = headline.headline(sweep, figures)

@@ -205,17 +205,20 @@ class _Actor:
     return numbers.label_text(self.labels)
 
 
-def make(folders: Sequence[pathlib.Path]) -> Scorecard:
+def make(
+    folders: Sequence[pathlib.Path], accept_other_code: bool = False
+) -> Scorecard:
   """Returns the scorecard of folders with results.
 
   Args:
     folders: Folders of sweeps, of scripted comparisons, and of reports on
       agents of Gymnasium.
+    accept_other_code: True to accept results of different code.
 
   Raises:
     ResultsError: If a folder has no results or is given twice, a file is
       damaged, rows are missing or belong to another design, two folders have
-      the same cell, or the rows are of different dynamics.
+      the same cell, or the rows are of different dynamics or code.
   """
   actors: list[_Actor] = []
   notes: list[str] = []
@@ -224,12 +227,21 @@ def make(folders: Sequence[pathlib.Path]) -> Scorecard:
     if folder_counts[folder.resolve()] > 1:
       raise errors.ResultsError(f'{folder}: given twice; must be given once')
     if result_folders.is_sweep(folder):
-      sweep = result_folders.load(folder)
+      sweep = result_folders.load(folder, accept_other_code)
       actors += _of_sweep(sweep)
       counts = collections.Counter(job.design for job in sweep.unfinished)
       notes += (f'{name}: {n} jobs are missing' for name, n in counts.items())
     else:
       actors += _of_rows(folder)
+  codes = {
+      row.info.versions.get(storage.CODE, 'unknown')
+      for actor in actors
+      for row in actor.rows
+  }
+  where = ', '.join(map(str, folders))
+  storage.check_codes(where, codes, accept_other_code)
+  if len(codes) > 1:
+    notes.append(f'rows of different code: {", ".join(sorted(codes))}')
   version, former = _version(actors)
   shown = _shown(actors)
   if not shown:

@@ -9,6 +9,7 @@ from unittest import mock
 from absl import flags as absl_flags
 from absl.testing import flagsaver
 
+from realab_suite import sources
 from realab_suite.launchers import flags
 from realab_suite.launchers import program
 
@@ -38,6 +39,8 @@ def run(module: Any, *arguments: str) -> Ended:
       status = error.code
     else:
       status = program._in_one_line(module.main, argv)
+      # Later tests are no part of the program.
+      sources.use([], [])
   return Ended(status, stdout.getvalue(), stderr.getvalue())
 
 

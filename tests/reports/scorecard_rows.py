@@ -36,6 +36,7 @@ def rows(
     failed=False,
     version='0.2.0',
     saturated=0,
+    **versions,
 ):
   """Returns episodes with true returns by seed, and a gain in each.
 
@@ -47,7 +48,7 @@ def rows(
       of, policy=policy, run=run or policy,
       baseline=None if (run or policy) == baseline else baseline,
       control_timestep=0.1, max_steps=max_steps,
-      versions={'realab_suite': version},
+      versions={'realab_suite': version, **versions},
   )  # fmt: skip
   figures = dict.fromkeys(episode_figures.RegisterFigures.model_fields, 0.25)
   registers = [

@@ -201,6 +201,18 @@ def test_the_version_follows_the_dynamics_and_the_worlds(tmp_path):
   )
 
 
+def test_rows_of_different_code_are_mixed_only_by_name(tmp_path):
+  known = scorecard_rows.rows('theirs', {0: [1]}, baseline='theirs', code='ab1')
+  folders = [
+      scorecard_rows.folder(tmp_path / 'one', *_runs(), agents=['mine']),
+      scorecard_rows.folder(tmp_path / 'two', known, agents=['theirs']),
+  ]
+  with pytest.raises(errors.ResultsError, match='code ab1 and unknown'):
+    scorecards.make(folders)
+  card = scorecards.make(folders, accept_other_code=True)
+  assert card.notes == ['rows of different code: ab1, unknown']
+
+
 @pytest.mark.parametrize(
     ('changes', 'complaint'),
     [
@@ -390,9 +402,10 @@ def test_the_program_reads_folders_and_published_results(sweep, tmp_path):
   publishing.publish(sweep, published)
   mine = scorecard_rows.folder(tmp_path / 'mine', *_runs(), agents=['mine'])
   output = tmp_path / 'card'
-  ended = in_process.run(
-      scorecard, f'--input={published},{mine}', f'--output={output}'
-  )
+  arguments = f'--input={published},{mine}', f'--output={output}'
+  # Rows of one are of a known code.
+  in_process.complaint(scorecard, *arguments)
+  ended = in_process.run(scorecard, *arguments, '--accept_other_code')
   assert ended.status == 0, ended.stderr
   assert '| mine ' in ended.stdout
   with open(output / 'scorecard.csv', newline='') as file:

@@ -58,7 +58,8 @@ class RunSpec(validation.Spec):
   """An agent to train.
 
   Attributes:
-    design: Name of a design of the package, or path of a YAML file.
+    design: Name of a design of the package, path of a YAML file, or its
+      contents.
     overrides: Dotted overrides of the design.
     learner: Fields that replace those of the learner in the design.
     twin: True to train the secure twin of the design as well.
@@ -72,7 +73,7 @@ class RunSpec(validation.Spec):
     twin_data: The same for the twin, recorded in the secure channel.
   """
 
-  design: option_types.FilePath
+  design: option_types.FilePath | dict[str, Any]
   overrides: Annotated[tuple[str, ...], pydantic.Field(strict=False)] = ()
   learner: dict[str, Any] = pydantic.Field(default_factory=dict)
   twin: bool = False
@@ -327,6 +328,14 @@ class ExperimentSpec(validation.Spec):
   def designs(self) -> Mapping[str, specs.DesignSpec]:
     """Designs of the runs with their changes, by the name of the run."""
     return self._designs
+
+  def to_copy(self) -> dict[str, Any]:
+    """Returns the experiment with its designs in place of their files."""
+    data = self.to_mapping()
+    for name, design in self.designs.items():
+      changes = {'design': design.to_source(), 'overrides': [], 'learner': {}}
+      data['runs'][name] |= changes
+    return data
 
   @property
   def domain_and_variation(self) -> tuple[str, str]:

@@ -5,7 +5,7 @@ a scripted policy that is evaluated. Its configuration contains everything that
 its results depend on, and a hash of it is part of the name of its folder.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 import contextlib
 import dataclasses
 from importlib import metadata
@@ -14,6 +14,7 @@ import pathlib
 from typing import Any, final
 
 from realab_suite import errors
+from realab_suite import sources
 from realab_suite import suite
 from realab_suite.config import messages
 from realab_suite.config import validation
@@ -21,6 +22,7 @@ from realab_suite.evaluation import results
 from realab_suite.feedback import objectives
 from realab_suite.feedback import specs
 from realab_suite.lab.experiments import experiment_specs
+from realab_suite.lab.experiments import kept_stakes
 from realab_suite.lab.experiments import recorded_data
 from realab_suite.lab.experiments import storage
 
@@ -116,6 +118,8 @@ class Job:
         'evaluation': experiment.evaluation.model_dump(),
         'versions': depends_on,
     }
+    if files := storage.digests_of_files(config['design']):
+      config['files'] = files
     if self.policy is None:
       config['training'] = self.training.to_mapping()
       if tasks := self.training.tasks:
@@ -180,8 +184,44 @@ class Job:
 
 
 def digest_of(config: Mapping[str, Any]) -> str:
-  """Returns the hash of a configuration, the end of the name of a folder."""
-  return validation.digest_of(config)[:_NUM_DIGITS]
+  """Returns the hash of a configuration, the end of the name of a folder.
+
+  It leaves out the code, so that a folder may have results of other code.
+  """
+  versions = {k: v for k, v in config['versions'].items() if k != storage.CODE}
+  return validation.digest_of({**config, 'versions': versions})[:_NUM_DIGITS]
+
+
+def check_codes(
+    planned: Iterable[Job],
+    output: pathlib.Path,
+    is_accepted: bool,
+    code: str | None = None,
+) -> None:
+  """Checks that jobs may be added to a folder, and continued.
+
+  Args:
+    planned: All jobs of the experiment, of which some may have begun.
+    output: Folder of the experiment.
+    is_accepted: True if the user accepts results of different code.
+    code: Code of what has started this process, or `None`.
+
+  Raises:
+    ResultsError: If the folder has results of other code; see `storage`.
+  """
+  here = sources.digest()
+  codes = [here, code or here, *kept_stakes.codes(output)]
+  others = {}
+  for path in output.glob(f'*/{storage.CONFIG}'):
+    ends = (path.with_name(x) for x in (storage.DONE, storage.CHECKPOINT))
+    if any(end.exists() for end in ends):
+      other = read_config(path.parent)['versions'].get(storage.CODE)
+      if other != here:
+        others[path.parent.name] = other
+  if others:  # Names of jobs take long to compute.
+    names = {job.folder() for job in planned}
+    codes += [other for name, other in others.items() if name in names]
+  storage.check_codes(output, codes, is_accepted)
 
 
 def read_config(folder: pathlib.Path) -> dict[str, Any]:
@@ -193,7 +233,9 @@ def read_config(folder: pathlib.Path) -> dict[str, Any]:
   """
   path = folder / storage.CONFIG
   config = storage.read_json(path)
-  is_mapping = isinstance(config, dict)
+  is_mapping = isinstance(config, dict) and isinstance(
+      config.get('versions'), dict
+  )
   if not is_mapping or not folder.name.endswith(f'-{digest_of(config)}'):
     raise errors.ResultsError(
         f'{path}: does not match the name of its folder; remove {folder} to run'

@@ -5,6 +5,7 @@ import fcntl
 import pathlib
 from typing import Final
 
+from realab_suite import sources
 from realab_suite import worlds
 from realab_suite.config import validation
 from realab_suite.feedback import specs
@@ -17,7 +18,10 @@ FOLDER: Final = 'stakes'
 
 
 def stakes_of(
-    world: worlds.World, design: specs.DesignSpec, folder: pathlib.Path
+    world: worlds.World,
+    design: specs.DesignSpec,
+    folder: pathlib.Path,
+    accept_other_code: bool = False,
 ) -> stakes.Stakes | None:
   """Returns the stakes of a design, and measures and keeps those that are new.
 
@@ -25,18 +29,22 @@ def stakes_of(
     world: The world.
     design: The design.
     folder: Folder of the experiment.
+    accept_other_code: True to accept stakes that other code has measured.
 
   Returns:
     The stakes, or `None`; see `judging.stakes_of`.
 
   Raises:
-    ResultsError: If a file is not JSON or cannot be read or written.
+    ResultsError: If a file is not JSON, cannot be read or written, or is of
+      other code, which is not accepted.
     SpecError: If it is damaged otherwise.
   """
   key = judging.key_of_stakes(world, design)
   if key is None:
     return None
-  path = folder / FOLDER / f'{key}.json'
+  files = storage.digests_of_files(design and design.to_mapping())
+  name = f'{key}-{validation.digest_of(files)}' if files else key
+  path = folder / FOLDER / f'{name}.json'
   with contextlib.ExitStack() as stack:
     with storage.explained(path):
       path.parent.mkdir(parents=True, exist_ok=True)
@@ -44,11 +52,30 @@ def stakes_of(
       # A job that needs the same stakes waits here until another has them.
       fcntl.flock(lock, fcntl.LOCK_EX)
     if path.exists():
-      content = storage.read_json(path)
-      kept = validation.validate(stakes.Stakes, content, str(path))
+      code, kept = _read(path)
       if kept.key == key:
+        codes = code, sources.digest()
+        storage.check_codes(path, codes, accept_other_code)
         return kept
     stake = judging.stakes_of(world, design)
     if stake is not None:
-      storage.write_json(path, stake.model_dump())
+      content = {storage.CODE: sources.digest(), **stake.model_dump()}
+      storage.write_json(path, content)
     return stake
+
+
+def codes(folder: pathlib.Path) -> list[str | None]:
+  """Returns the codes of the stakes in the folder of an experiment.
+
+  Raises:
+    RealabError: As `stakes_of` does, if a file is damaged.
+  """
+  return [_read(path)[0] for path in (folder / FOLDER).glob('*.json')]
+
+
+def _read(path: pathlib.Path) -> tuple[str | None, stakes.Stakes]:
+  """Returns the code, `None` if it is unknown, and the stakes of a file."""
+  content = storage.read_json(path)
+  is_mapping = isinstance(content, dict)
+  code = content.pop(storage.CODE, None) if is_mapping else None
+  return code, validation.validate(stakes.Stakes, content, str(path))

@@ -13,6 +13,7 @@ import tqdm
 import yaml
 
 from realab_suite import errors
+from realab_suite import sources
 from realab_suite.config import loading
 from realab_suite.lab.experiments import engines
 from realab_suite.lab.experiments import experiment_specs
@@ -20,6 +21,8 @@ from realab_suite.lab.experiments import jobs
 from realab_suite.lab.experiments import storage
 
 EXPERIMENT = 'experiment.yaml'
+# The same with its designs, from which jobs run: files may change meanwhile.
+_COPY = 'jobs.yaml'
 SWEEP = 'sweep.json'
 LOGS = 'logs'
 AUDITS = 'audits'
@@ -41,6 +44,7 @@ def sweep(
     only: Sequence[str] = (),
     calibration: bool = False,
     arguments: Sequence[str] = (),
+    accept_other_code: bool = False,
 ) -> None:
   """Runs the unfinished jobs of an experiment.
 
@@ -52,6 +56,7 @@ def sweep(
     only: Names of the runs to execute; empty for all.
     calibration: True to use the calibration seeds.
     arguments: Further arguments of `launchers.train`.
+    accept_other_code: True to accept that results of other code are mixed.
 
   Raises:
     RealabError: If the experiment or the folder is invalid, or if a job fails.
@@ -70,8 +75,14 @@ def sweep(
       wanted, key=lambda job: (seeds.index(job.seed), job.policy is not None)
   )
   with storage.locked(output):
+    jobs.check_codes(planned, output, accept_other_code)
     (output / LOGS).mkdir(exist_ok=True)
     _describe(experiment, planned, calibration, output)
+    arguments = (
+        *arguments,
+        f'--code={sources.digest()}',
+        f'--accept_other_code={accept_other_code}',
+    )
     _Sweep(wanted, engine, output, say, arguments).run()
 
 
@@ -110,6 +121,8 @@ def _describe(
   }
   storage.write_json(output / SWEEP, description)
   storage.write_whole(output / EXPERIMENT, text.encode())
+  text = yaml.safe_dump(experiment.to_copy(), sort_keys=False)
+  storage.write_whole(output / _COPY, text.encode())
 
 
 def check_experiment(
@@ -255,10 +268,11 @@ class _Sweep:
         sys.executable,
         '-m',
         _MODULE,
-        f'--experiment={self._output / EXPERIMENT}',
+        f'--experiment={self._output / _COPY}',
         f'--run={run.job.run}',
         f'--seed={run.job.seed}',
         f'--output={self._output}',
+        f'--planned={run.folder.name}',
         *self._arguments,
     ]
     run.task = self._engine.start(command, run.log)

@@ -4,10 +4,11 @@ A process may be killed at any time. Files are not synchronised with the disk,
 so a power failure may damage them.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 import contextlib
 import errno
 import fcntl
+import hashlib
 import json
 import os
 import pathlib
@@ -15,6 +16,10 @@ from typing import Any, Final, final
 
 from realab_suite import archive
 from realab_suite import errors
+from realab_suite import sources
+
+CODE: Final = 'code'
+"""Key of the digest of the sources among versions."""
 
 CONFIG = 'config.json'
 DONE = 'done.json'
@@ -170,6 +175,42 @@ def naming(path: pathlib.Path, advice: str = '') -> Iterator[None]:
     yield
   except errors.StateLayoutError as error:
     raise errors.ResultsError(f'{path}: {error}{advice}') from error
+
+
+def check_codes(
+    where: object, codes: Iterable[str | None], is_accepted: bool
+) -> None:
+  """Checks that results are of one code, which is that of `sources`.
+
+  Args:
+    where: Place of the results.
+    codes: Codes of the results; `None` where it is unknown.
+    is_accepted: True if the user accepts results of different code.
+
+  Raises:
+    ResultsError: If there are several codes, which are not accepted.
+  """
+  names = sorted({code or 'unknown' for code in codes})
+  if len(names) > 1 and not is_accepted:
+    here = sources.digest()
+    raise errors.ResultsError(
+        f'{where}: would mix results of code {" and ".join(names)} (here:'
+        f' {here}, of {sources.FOLDER}); name another folder, or accept it with'
+        ' --accept_other_code'
+    )
+
+
+def digests_of_files(data: Any) -> dict[str, str]:
+  """Returns digests of the files that plain data names, by their paths."""
+  if isinstance(data, str):
+    if not (os.path.splitext(data)[1] and os.path.isfile(data)):
+      return {}
+    with explained(data), open(data, 'rb') as file:
+      return {data: hashlib.file_digest(file, 'sha256').hexdigest()[:16]}
+  parts = data.values() if isinstance(data, Mapping) else data
+  if not isinstance(parts, Iterable):
+    return {}
+  return {k: v for part in parts for k, v in digests_of_files(part).items()}
 
 
 def begin(folder: pathlib.Path, config: Mapping[str, Any]) -> None:

@@ -213,6 +213,15 @@ class Sweep:
     jobs = (job for run in self.runs.values() for job in run.jobs)
     return list(dict.fromkeys(job.seed for job in jobs))
 
+  @property
+  def codes(self) -> set[str]:
+    """Codes of all rows; see `results.versions`."""
+    return {
+        row.info.versions.get(storage.CODE, 'unknown')
+        for run in self.runs.values()
+        for row in (*run.rows, *run.transplants, *run.stages)
+    }
+
   def learned(self) -> list[Run]:
     """Returns the runs of learners, except twins."""
     return [

@@ -16,6 +16,7 @@ import dm_env
 import numpy as np
 
 from realab_suite import errors
+from realab_suite import sources
 from realab_suite.engine import batch_environment
 from realab_suite.engine import batch_time_steps
 from realab_suite.engine import seeding
@@ -64,10 +65,12 @@ class Options:
   Attributes:
     say: Called with messages for the user.
     parent: Process whose end also ends the job, or `None`.
+    accept_other_code: True to accept that results of other code are mixed.
   """
 
   say: Say
   parent: int | None = None
+  accept_other_code: bool = False
 
   def check_parent(self) -> None:
     """Raises a `ResultsError` if the parent has ended."""
@@ -91,16 +94,25 @@ def run(job: jobs.Job, output: pathlib.Path, options: Options) -> pathlib.Path:
 
   Raises:
     RealabError: If the job is invalid, its folder belongs to another one, a
-      checkpoint is damaged or the disk is full.
+      checkpoint is damaged or of other code, or the disk is full.
   """
   options.check_parent()
   path = output / job.folder()
   with storage.locked(path):
     storage.begin(path, job.config())
-    jobs.read_config(path)  # Refuses another configuration.
+    config = jobs.read_config(path)  # Refuses another configuration.
     if (path / storage.DONE).exists():
       options.say(f'{path} has finished already')
       return path
+    code = config['versions'].get(storage.CODE, 'unknown')
+    if code != sources.digest():
+      checkpoint = path / storage.CHECKPOINT
+      if checkpoint.exists():
+        raise errors.ResultsError(
+            f'{checkpoint}: a learner of code {code}, which never continues on'
+            f' code {sources.digest()}{storage.RESTART}'
+        )
+      storage.write_json(path / storage.CONFIG, job.config())
     learner = None
     facts: dict[str, Any] = {
         'machines': [{'step': 0, 'machine': machines.here()}]
@@ -111,11 +123,19 @@ def run(job: jobs.Job, output: pathlib.Path, options: Options) -> pathlib.Path:
       storage.write_archive(
           path / LEARNER, header(job.digest(), LEARNER), state
       )
-    rows = _evaluate(job, learner, path / TRACE, output)
+    rows = _evaluate(job, learner, path / TRACE, output, options)
     storage.write_whole(path / EPISODES, rows)
     if job.embedded is not None:
-      rows = _evaluate(job.transplant, learner, None, output)
+      rows = _evaluate(job.transplant, learner, None, output, options)
       storage.write_whole(path / TRANSPLANT, rows)
+    # Some modules are imported only now, and files read again.
+    is_same = sources.current_digest() == sources.digest()
+    if job.folder() != path.name or not (is_same or options.accept_other_code):
+      raise errors.ResultsError(
+          f'{path}: the code {sources.digest()}, or a file that the design'
+          ' names, has changed since this job began; restore it, then the same'
+          ' command continues the job'
+      )
     storage.finish(path, facts)
   options.say(f'Results are in {path}')
   return path
@@ -269,6 +289,7 @@ def _evaluate(
     learner: 'agents.Learner | None',
     trace: pathlib.Path | None,
     output: pathlib.Path,
+    options: Options,
 ) -> bytes:
   """Evaluates the learner or the scripted policy of a job.
 
@@ -278,6 +299,7 @@ def _evaluate(
     trace: File to write a trace to; `None` for neither a trace nor an
       attribution.
     output: Folder of the experiment.
+    options: Options for running the job.
 
   Returns:
     The rows of the episodes, as lines.
@@ -308,7 +330,9 @@ def _evaluate(
       attributions = [attributor.metrics(i) for i in range(len(outcomes))]
       of_trace = header(job.digest(), TRACE)
       storage.write_archive(trace, of_trace, tracer.trace())
-    stake = kept_stakes.stakes_of(world, job.design, output)
+    stake = kept_stakes.stakes_of(
+        world, job.design, output, options.accept_other_code
+    )
     info = job.info(batch.task.control_timestep)
   judged = [
       result.of_run(info, stake=stake, attribution=metrics)
@@ -377,7 +401,7 @@ class _Training:
         self._begin_segment()
         stack.callback(lambda: self._batch.close())
       learner = make_learner(job, self._recorded or self._batch)
-      _check_credit(job, learner.largest_credit, path.parent)
+      _check_credit(job, learner.largest_credit, path.parent, self._options)
       self._add_machine(learner, saved)
       if saved is None:
         time_step = (
@@ -487,7 +511,11 @@ class _Training:
         (jobs.UNADAPTED, job.experiment.task),
     ):
       rows = _evaluate(
-          job.at_stage(stage, task), learner, None, self._path.parent
+          job.at_stage(stage, task),
+          learner,
+          None,
+          self._path.parent,
+          self._options,
       )
       self._files[STAGES].write(rows)
 
@@ -572,7 +600,10 @@ class LearnerActor:
 
 
 def _check_credit(
-    job: jobs.Job, largest: float | None, output: pathlib.Path
+    job: jobs.Job,
+    largest: float | None,
+    output: pathlib.Path,
+    options: Options,
 ) -> None:
   """Refuses a learner to which honest competence earns more than it credits.
 
@@ -580,13 +611,16 @@ def _check_credit(
     job: The job.
     largest: Largest sum of readings that the learner credits, or `None`.
     output: Folder of the experiment.
+    options: Options for running the job.
 
   Raises:
     SpecError: If it is less than the stake of the design.
   """
   if largest is None:
     return
-  stake = kept_stakes.stakes_of(job.experiment.world, job.design, output)
+  stake = kept_stakes.stakes_of(
+      job.experiment.world, job.design, output, options.accept_other_code
+  )
   if stake is not None and largest < stake.main.low:
     raise errors.SpecError(
         f'learner.defence: credits {largest:g} in an episode; honest competence'
