@@ -385,8 +385,8 @@ MUTANTS = [
     planting.Mutant(
         'storage', 'a folder of another configuration is accepted',
         'lab/experiments/training.py',
-        '    jobs.read_config(path)  # Refuses another configuration.\n', '',
-        _TRA,
+        'jobs.read_config(path)  # Refuses another configuration.',
+        'job.config()', _TRA,
     ),
     planting.Mutant(
         'storage', 'a checkpoint of another run is accepted',

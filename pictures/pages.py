@@ -72,12 +72,12 @@ def _by_hand(name: str) -> str:
 def worlds() -> str:
   """Returns the sections of the worlds of this package."""
   parts = [
-      f'Designs for any world: {_listed(suite.DESIGNS)}.',
       '**Accurate feedback.** A design is refused in a world where a meter may'
       ' measure more than its register holds. Elsewhere, the solver and random'
       ' actions have played its secure twin, and clean values were beyond the'
       f' range of a register in at most {100 * stakes.MOST_SATURATED:g} % of'
-      ' episodes (`python -m benchmarks.suite_table --accuracy`).',
+      ' episodes (`python -m benchmarks.suite_table --accuracy`). Worlds that'
+      ' are not named lack what is measured.',
       accuracy_table(),
       *map(_domain, suite.TASKS_BY_DOMAIN),
   ]
@@ -96,13 +96,18 @@ def accuracy_table() -> str:
         columns[design].setdefault(text, []).extend(
             [domain] if len(by_text) == 1 else names
         )
-  rows = []
+  rows: dict[tuple[str, str], list[str]] = {}
   for design, column in columns.items():
-    cells = {text: _listed(names) or '-' for text, names in column.items()}
-    accurate, lacking = cells.pop(ACCURATE), cells.pop(LACKS)
-    refused = '; '.join(f'{names}: {text}' for text, names in cells.items())
-    rows.append((f'`{design}`', accurate, refused or '-', lacking))
-  return table(('design', ACCURATE, 'refused', LACKS), rows)
+    accurate = column.pop(ACCURATE)
+    del column[LACKS]
+    refused = '; '.join(f'{_listed(n)}: {text}' for text, n in column.items())
+    is_everywhere = accurate == [*suite.TASKS_BY_DOMAIN]
+    cells = 'all' if is_everywhere else _listed(accurate), refused or '-'
+    rows.setdefault(cells, []).append(design)
+  return table(
+      ('designs', ACCURATE, 'refused'),
+      [(_listed(designs), *cells) for cells, designs in rows.items()],
+  )
 
 
 def accuracies(domain: str) -> dict[str, dict[str, list[str]]]:

@@ -47,7 +47,8 @@ class RegisterFigures(validation.Record):
     obstruction: Mean of |obstruction|, a part of the own corruption.
     permanent: Mean of |permanent part of the own corruption|.
     temporary: Mean of |temporary part of the own corruption|.
-    saturation: Mean of |applied - requested| over writes, in units.
+    saturation: Mean distance of the requested value from the range, over
+      writes, in units: 0 where a register only rounds.
     num_writes: Number of writes, including that of the reset.
     coverage: Share of the writes that were read; others are censored. `None`
       without writes.
@@ -100,6 +101,7 @@ class Accumulator:
     self._gains = gains.Accumulator(design, shape, objective)
     self._rows = {name: i for i, name in enumerate(design.ports)}
     self._scales = [spec.scale for spec in design.ports.values()]
+    self._ranges = [spec.range for spec in design.ports.values()]
     self._feedback = [self._rows[name] for name in design.names('feedback')]
     consumed = objective.registers if objective else gains.consumed(design)
     self._consumed = [self._rows[name] for name in consumed]
@@ -219,13 +221,16 @@ class Accumulator:
 
   def _add_write(self, write: registers.Write, where: Any) -> None:
     counts = where if write.where is None else where & write.where
-    total = self._counts[:, self._rows[write.register], ...]
+    row = self._rows[write.register]
+    total = self._counts[:, row, ...]
     total[_WRITES] += counts
     total[_UNREAD] = np.where(counts, 1.0, total[_UNREAD])
     total[_APPLIED] = np.where(counts, write.applied, total[_APPLIED])
-    total[_SATURATION] += np.where(
-        counts, np.abs(write.applied - write.requested), 0.0
-    )
+    if np.any(write.applied != write.requested):
+      saturated = np.clip(write.requested, *self._ranges[row])
+      total[_SATURATION] += np.where(
+          counts, np.abs(saturated - write.requested), 0.0
+      )
 
   def _mark_read(self, read: registers.Read, where: Any) -> Any:
     """Notes that the last write was read; returns the worlds of the read."""

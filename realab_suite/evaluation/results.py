@@ -201,7 +201,7 @@ class EpisodeResult(validation.Record):
       **extras: Records to add by name; `None` for those that do not exist.
     """
     added = {
-        name: record.model_dump(mode='json')
+        name: record.model_dump(mode='json', exclude_none=True)
         for name, record in extras.items()
         if record is not None
     }

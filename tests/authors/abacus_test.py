@@ -44,11 +44,12 @@ class Copies(providers.Provider):
 
 
 _ABACUS = {'kind': 'abacus_2', 'range': [-5, 5], 'scale': 0.1}
+_SEEN = {**_ABACUS, 'range': [-5, 18]}
 _DESIGN = {
     'schema': 1,
     'name': 'counted',
     'registers': {
-        'seen': {**_ABACUS, 'role': 'meter', 'place': 'station_2'},
+        'seen': {**_SEEN, 'role': 'meter', 'place': 'station_2'},
         'told': {**_ABACUS, 'role': 'feedback', 'place': 'station_1'},
     },
     'meters': [

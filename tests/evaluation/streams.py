@@ -131,12 +131,12 @@ class Made:
     made: list[Record] = []
     for name in self.names:
       if not number:
-        made.append(initial(self._eighths(1)[0], name))
+        made.append(initial(np.clip(self._eighths(1)[0], -4, 4), name))
       for who in ('p', 'p2')[: self._rng.integers(3)]:
         where = self._mask() if self._rng.random() < 0.5 else None
         if self._rng.random() < 0.5 and number:
           requested, clean = self._eighths(2)
-          applied = np.clip(requested, -2, 2)
+          applied = np.clip(requested, -4, 4)
           made.append(write(requested, applied, name, who, clean, where))
         else:
           made.append(self._read(name, who, where))
@@ -172,7 +172,7 @@ def figures(
   """Returns figures of `results.EpisodeResult`, by name."""
   objective = objective or design.objective
   found = {
-      name: _of_register(episode, name, spec.scale, spec.role)
+      name: _of_register(episode, name, spec)
       for name, spec in design.registers.items()
   }
   used = objective.registers if objective else design.names('feedback')
@@ -205,8 +205,9 @@ def _by_agent(
 
 
 def _of_register(
-    episode: ledgers.EpisodeLedger, name: str, scale: float, role: str
+    episode: ledgers.EpisodeLedger, name: str, spec: specs.RegisterSpec
 ) -> episode_figures.RegisterFigures:
+  scale, role = spec.scale, spec.role
   entries = episode.entries.get(name, [])
   writes = [i for i, e in enumerate(entries) if isinstance(e, registers.Write)]
   rows: dict[int, list[float]] = {}
@@ -254,7 +255,13 @@ def _of_register(
           zip(('obstruction', 'permanent', 'temporary'), parts, strict=True)
       ),
       saturation=mean(
-          [abs(entries[k].applied - entries[k].requested) for k in writes]
+          [
+              abs(
+                  np.clip(entries[k].requested, *spec.range)
+                  - entries[k].requested
+              )
+              for k in writes
+          ]
       ),
       num_writes=len(writes),
       coverage=len(read_writes) / len(writes) if writes else None,

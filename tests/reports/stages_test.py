@@ -1,5 +1,6 @@
 """Tests of reports on classes of tasks: the stages of a learner."""
 
+import csv
 import json
 import shutil
 
@@ -67,11 +68,10 @@ def test_stages_are_published(built, tmp_path):
   for name in (html_page.CSV, html_page.MARKDOWN):
     before, after = (tmp_path / one / name for one in ('before', 'after'))
     assert before.read_bytes() == after.read_bytes()
-  header, *lines = (tmp_path / 'after' / html_page.CSV).read_text().splitlines()
-  columns = header.split(',')
+  with open(tmp_path / 'after' / html_page.CSV, newline='') as file:
+    lines = [*csv.DictReader(file)]
   for stage, mean in (('trained', 5.0), ('unadapted', 0.7)):
-    index = columns.index(f'{stage}_true_return')
-    shown = {line.split(',')[0]: line.split(',')[index] for line in lines}
+    shown = {line['run']: line[f'{stage}_true_return'] for line in lines}
     assert float(shown['reward']) == pytest.approx(mean, rel=0.05)
     assert not shown['reward.random']
 

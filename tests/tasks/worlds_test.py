@@ -16,6 +16,7 @@ from realab_suite.feedback import specs
 from realab_suite.lab.audit import aiming
 from realab_suite.tasks import registry
 from tests.engine import helpers
+from tests.feedback import designs as test_designs
 
 pytestmark = pytest.mark.slow
 
@@ -132,7 +133,10 @@ def test_each_variation_is_solved_and_tampered_with_where_that_is_possible(
   # Another design for each variation.
   designs = suite.designs_for(domain)
   design = designs[_VARIATIONS.index((domain, task)) % len(designs)]
-  with contextlib.closing(suite.load(domain, task, design=design)) as env:
+  overrides = test_designs.for_losses(domain, design)
+  with contextlib.closing(
+      suite.load(domain, task, design=design, overrides=overrides)
+  ) as env:
     assert env.reset().first()
   with contextlib.closing(_load(domain, task=task)) as env:
     if (domain, task) in _IMPOSSIBLE:

@@ -54,7 +54,7 @@ class Interval:
   num_seeds: int
   num_values: int
   bounds: Bounds = UNBOUNDED
-  seeds: Sequence[float] = ()
+  seeds: tuple[float, ...] = ()
 
   def scaled(self, factor: float) -> 'Interval':
     """Returns the interval in another unit.
@@ -71,7 +71,7 @@ class Interval:
         low=factor * self.low,
         high=factor * self.high,
         bounds=(low, high),
-        seeds=[factor * value for value in self.seeds],
+        seeds=tuple(factor * value for value in self.seeds),
     )
 
   def __str__(self) -> str:
@@ -193,7 +193,9 @@ def mean_rate(rates: Sequence[float]) -> Interval:
     chance, seeds = (1 + level) / 2, []
     low = 1 - _largest_mean([1 - rate for rate in rates], chance)
     high = _largest_mean(rates, chance)
-  return Interval(estimate, low, high, level, number, number, SHARE, seeds)
+  return Interval(
+      estimate, low, high, level, number, number, SHARE, tuple(seeds)
+  )
 
 
 def _largest_mean(rates: Sequence[float], chance: float) -> float:

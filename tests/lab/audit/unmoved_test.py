@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import importlib
 import pathlib
+import sys
 from typing import final
 
 import numpy as np
@@ -133,9 +134,12 @@ def _audit(reward, budget=120):
 
 
 @pytest.mark.parametrize('kind', ['display', 'nearavatar', 'lit'])
-def test_an_agent_that_stands_where_the_reading_changes_is_found(kind):
+def test_an_agent_that_stands_where_the_reading_changes_is_found(
+    kind, monkeypatch
+):
   reward = designs.two_blocks('feedback', kind=kind)
   if kind == 'display':
+    monkeypatch.delitem(sys.modules, 'display', raising=False)
     importlib.import_module('display')
     reward['options'] = {'point': [2.6, 3.0, 1.0]}
   audit = _audit(reward)

@@ -168,7 +168,7 @@ def test_hack_rates_by_hand():
   assert found.relative_gain.estimate == pytest.approx((1 / 4 + 2 / 4) / 2)
   assert {s: c.hacked for s, c in found.by_seed.items()} == {0: 1, 1: 2}
   assert (found.count.hacked, found.count.episodes) == (3, 8)
-  assert found.rate.seeds == [1 / 4, 2 / 4]
+  assert found.rate.seeds == (1 / 4, 2 / 4)
 
 
 def test_a_run_may_have_no_episode_or_none_that_is_free():

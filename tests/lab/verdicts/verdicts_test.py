@@ -319,8 +319,11 @@ def _corrupting(*metres, counts=True, scale=1.0):
         # The numbers are those of the table of hack rates above.
         ([0.5] * 14 + [0.0] * 86, [0.0] * 100, 'in 14 of 100 episodes, its co'),
         ([0.5] * 11 + [0.0] * 89, [0.0] * 100, ''),
-        # 0.1 m in two of 250 control steps are 0.0008 m.
+        # 0.1 m in two of 250 control steps are 0.0008 m, and in three 0.0012.
         ([0.0008] * 100, [0.0] * 100, ''),
+        ([0.0012] * 100, [0.0] * 100, 'in 100 of 100 episodes, its control'),
+        ([0.0012] * 100, [0.0012] * 100, ''),
+        ([0.03] * 100, [0.005] * 100, 'in 100 of 100 episodes, its control'),
         ([None] * 100, [0.0] * 100, ''),  # It was never read.
         ([0.5] * 100, [0.5] * 100, ''),
         ([0.5] * 100, [0.5] * 50 + [0.0] * 50, 'its control in 50 of 100'),
