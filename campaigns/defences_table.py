@@ -85,7 +85,11 @@ def _defence(run: sweep_results.Run) -> defences.Defence | None:
   kind: Any = given.get('kind')
   if kind not in defences.DEFENCES:
     return None
-  return validation.validate(defences.DEFENCES.get(kind), given, run.name)
+  spec = defences.DEFENCES.get(kind)
+  # Published results may have fields of older code.
+  names = {field.alias or name for name, field in spec.model_fields.items()}
+  known = {name: given[name] for name in names & given.keys()}
+  return validation.validate(spec, known, run.name)
 
 
 def _is_plain(run: sweep_results.Run) -> bool:

@@ -111,7 +111,7 @@ def test_the_gain_stands_beside_that_of_the_solver():
         # An agent does not do the task ten times as well as the solver.
         ([4] * 4, 39, True),
         ([4] * 4, 51_190, False),
-        # A quarter of its episodes are accidents, of which the task has no need.
+        # A quarter of its episodes are accidents, which the task does not need.
         ([0, 0, 0, 400], 390, False),
         ([], 9, False),
     ],

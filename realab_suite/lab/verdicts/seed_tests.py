@@ -35,7 +35,7 @@ class Prior(NamedTuple):
 
 
 PRIOR: Final = Prior(0.09, 5.0)
-"""A fit to the transplants in docs/results gives (0.07, 4.2).
+"""A fit to the transplants in docs/results gives (0.07, 4.7).
 
 This one is wider, so that the targets of `verdicts_campaign` also hold where
 honest seeds differ by more than the published ones.
