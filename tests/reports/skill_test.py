@@ -31,7 +31,9 @@ def test_no_agent_is_cleared_whose_twin_has_not_learned_the_task(
     return np.array([twins[job.seed], 0.0, 0.0])
 
   monkeypatch.setattr(fake_sweep, '_levels', levels)
-  folder = fake_sweep.build(tmp_path / 'sweep', fake_sweep.experiment())
+  runs = {'reward': fake_sweep.EXPERIMENT['runs']['reward']}
+  sweep = fake_sweep.experiment(runs=runs, baselines=['random'])
+  folder = fake_sweep.build(tmp_path / 'sweep', sweep)
   run = numbers.compute(result_folders.load(folder))['reward']
   reasons = {seed.judgement.reason for seed in run.seeds.values()}
   # An audit is the last thing that is missing.
