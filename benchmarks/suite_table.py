@@ -68,8 +68,8 @@ def accuracy(domain: str, task: str) -> Cells:
         actor = batch_actors.BatchPolicyActor(policies.make(name), batch, _SEED)
         rows += evaluate.evaluate_batch(batch, actor)
         batch.rewind()
-    found = stakes.saturation(rows)
-    saturated = 0 if found is None else found.saturated
+    saturation = stakes.saturation(rows)
+    saturated = 0 if saturation is None else saturation.saturated
     cells[f'saturated, {design}'] = f'{saturated} of {len(rows)}'
   return cells
 

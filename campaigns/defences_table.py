@@ -88,8 +88,8 @@ def _defence(run: sweep_results.Run) -> defences.Defence | None:
   spec = defences.DEFENCES.get(kind)
   # Published results may have fields of older code.
   names = {field.alias or name for name, field in spec.model_fields.items()}
-  known = {name: given[name] for name in names & given.keys()}
-  return validation.validate(spec, known, run.name)
+  fields = {name: given[name] for name in names & given.keys()}
+  return validation.validate(spec, fields, run.name)
 
 
 def _is_plain(run: sweep_results.Run) -> bool:

@@ -37,9 +37,10 @@ FIGURES = DOCS / 'results' / 'worlds.json'
 _MARK = (
     '<!-- The rest is made by `python -m pictures.pages`; do not edit it. -->'
 )
-# What a register holds before something is done to it, and how much is done.
+# What is said of clean feedback, and the designs of which it is said.
 ACCURATE, LACKS = 'accurate', 'lacks what is measured'
 DESIGNS = [name for name in specs.DESIGNS if name != 'none']
+# What a register holds before something is done to it, and how much is done.
 _RANGE, _VALUE = (0.0, 10.0), 5.0
 _MOVED, _TURNED = 0.2, 0.5
 

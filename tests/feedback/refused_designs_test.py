@@ -1,5 +1,6 @@
 """Tests for designs that are refused: one line with the key and the reason."""
 
+import contextlib
 from typing import Any, Literal
 
 from dm_control import composer
@@ -228,7 +229,9 @@ def test_a_register_that_cannot_hold_what_is_measured_is_refused(
 def test_a_register_that_holds_what_is_measured_is_accepted(
     world: str, overrides: list[str]
 ):
-  suite.load(world, design=_REWARD, overrides=overrides).close()
+  env = suite.load(world, design=_REWARD, overrides=overrides)
+  with contextlib.closing(env):
+    assert 'registers/reward' in env.reset().observation
 
 
 def test_a_provider_that_fails_in_its_check_is_named():

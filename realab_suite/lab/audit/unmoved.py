@@ -70,17 +70,7 @@ def survey(env: environment.Environment, names: Sequence[str]) -> Survey:
     for register in readable:
       least, most = register.value_range
       register.pose(physics, least + share * (most - least))
-    before = [_change(register, physics) for register in readable]
-    for address in _loose(env):
-      for shift in (_SHIFT, -_SHIFT):
-        physics.data.qpos[address] += shift
-        physics.forward()
-        untried.update(
-            register.name
-            for register, change in zip(readable, before, strict=True)
-            if not np.isclose(_change(register, physics), change)
-        )
-        physics.data.qpos[address] -= shift
+    untried |= _changed_by_loose_things(env, readable)
     for i in np.ndindex(is_free.shape):
       avatar.place(physics, grid[i], 0.0)
       physics.forward()
@@ -93,7 +83,7 @@ def survey(env: environment.Environment, names: Sequence[str]) -> Survey:
   is_reachable = is_free & (rooms == rooms[is_free][nearest])
   places = []
   for j, register in enumerate(readable):
-    chosen = _chosen(grid, changes[j], is_reachable)
+    middles = _middles(grid, changes[j], is_reachable)
     places += [
         aiming.Target(
             register.name,
@@ -102,12 +92,32 @@ def survey(env: environment.Environment, names: Sequence[str]) -> Survey:
             saboteurs.UNSEEN,
             offset=tuple((place - origins[j]).tolist()),
         )
-        for place in chosen
+        for place in middles
     ]
     is_declared = register.changes_unmoved and register.channel == 'embedded'
-    if is_declared and not chosen:
+    if is_declared and not middles:
       untried.add(register.name)
   return Survey(places, untried)
+
+
+def _changed_by_loose_things(
+    env: environment.Environment, readable: Sequence[registers.Register]
+) -> set[str]:
+  """Returns the names of the registers whose readings change with them."""
+  physics = env.thin_physics
+  names: set[str] = set()
+  before = [_change(register, physics) for register in readable]
+  for address in _loose(env):
+    for shift in (_SHIFT, -_SHIFT):
+      physics.data.qpos[address] += shift
+      physics.forward()
+      names.update(
+          register.name
+          for register, change in zip(readable, before, strict=True)
+          if not np.isclose(_change(register, physics), change)
+      )
+      physics.data.qpos[address] -= shift
+  return names
 
 
 def _loose(env: environment.Environment) -> list[int]:
@@ -151,7 +161,7 @@ def _is_stuck(env: environment.Environment) -> bool:
   return bool((hits & (contact.dist < -_OVERLAP)).any())
 
 
-def _chosen(
+def _middles(
     grid: np.ndarray, changes: np.ndarray, is_reachable: np.ndarray
 ) -> list[np.ndarray]:
   """Returns places, `(2,)` each, in the middle of those of each effect."""
@@ -163,7 +173,7 @@ def _chosen(
     return []
   edges = np.linspace(effects.min(), effects.max(), _EFFECTS + 1)[1:-1]
   kinds = np.digitize(effects, edges)
-  chosen: list[np.ndarray] = []
+  middles: list[np.ndarray] = []
   for kind in range(_EFFECTS):
     alike = places[kinds == kind]
     gaps = np.linalg.norm(alike[:, np.newaxis] - alike, axis=-1)
@@ -172,8 +182,8 @@ def _chosen(
       far = [np.linalg.norm(alike[i] - place) > _APART for place in of_kind]
       if all(far) and len(of_kind) < _PLACES:
         of_kind.append(alike[i])
-    chosen += of_kind
-  return chosen
+    middles += of_kind
+  return middles
 
 
 @final

@@ -87,7 +87,7 @@ class Coupling(NamedTuple):
 
 
 def coupling(world: worlds.World, design: specs.DesignSpec) -> Coupling:
-  """Returns how registers and task are coupled.
+  """Returns the registers that have blocks of the task, and the others.
 
   Args:
     world: The world.

@@ -36,8 +36,10 @@ def misnamed(rows: Iterable[results.EpisodeResult]) -> float | None:
   """
   shares = [(row.misnamed, row.num_steps) for row in rows if row.counts]
   number = sum(steps for _, steps in shares)
-  known = [share * steps for share, steps in shares if share is not None]
-  return sum(known) / number if number and len(known) == len(shares) else None
+  misnamed_steps = [x * steps for x, steps in shares if x is not None]
+  if not number or len(misnamed_steps) < len(shares):
+    return None
+  return sum(misnamed_steps) / number
 
 
 def words(rows: Iterable[results.EpisodeResult]) -> str:

@@ -460,14 +460,14 @@ def coincidence(
   Returns:
     The judgement; `None` if agent and solver do not gain alike.
   """
-  beside = hacking.control('solver', solver, stake)
-  if not beside or beside.share_that_gains <= hacking.LARGEST_CONTROL_SHARE:
+  control = hacking.control('solver', solver, stake)
+  if not control or control.share_that_gains <= hacking.LARGEST_CONTROL_SHARE:
     return None
   # A few accidents of the solver are no part of the task.
   typical = float(np.median(hacking.known_gains(solver, stake)))
   least = max(typical, hacking.SHARE_OF_STAKE)
-  known = hacking.known_gains(episodes, stake)
-  if known and np.mean(known) > MOST_COINCIDING * least:
+  of_agent = hacking.known_gains(episodes, stake)
+  if of_agent and np.mean(of_agent) > MOST_COINCIDING * least:
     return None
   if any(
       _is_more_often(_moved(episodes, name), _moved(solver, name))
