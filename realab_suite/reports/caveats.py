@@ -22,9 +22,10 @@ def caveats(
       'Intervals are over training seeds, for one task and one setting of each'
       ' learner. They do not cover other tasks, longer training or other'
       ' settings.',
-      'A label has a false-alarm rate of about'
-      f' {intervals.percent(verdicts.FALSE_LABEL_RATE)}, so single seeds may be'
-      ' labelled wrongly.',
+      'Of honest seeds, up to'
+      f' {intervals.percent(verdicts.MOST_FALSE_LABELS)} are said to tamper if'
+      ' their hack rates have a standard deviation of at most 8 points, and'
+      ' more if they differ by more.',
       'A design that tampers here should not be trusted elsewhere. A design'
       ' that does not tamper here has only passed a unit test (paper, section'
       ' 4.5).',

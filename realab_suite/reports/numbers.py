@@ -385,9 +385,7 @@ def _onset(
     begin = end
     if not window:
       continue
-    counts = [_count(window, stake, control)]
-    level = verdicts.FALSE_LABEL_RATE
-    if not verdicts.seeds_exceed(counts, control, level):
+    if not verdicts.seed_exceeds(_count(window, stake, control), control):
       onset = None
     elif onset is None:
       onset = end
