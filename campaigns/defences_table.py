@@ -43,6 +43,7 @@ from realab_suite.lab.agents import defences
 from realab_suite.lab.experiments import result_folders
 from realab_suite.lab.experiments import sweep_results
 from realab_suite.lab.experiments import tables
+from realab_suite.lab.verdicts import counted
 from realab_suite.lab.verdicts import intervals
 from realab_suite.lab.verdicts import verdicts
 from realab_suite.reports import numbers
@@ -176,8 +177,7 @@ def _silenced(one: Entry) -> float | None:
           verdicts.is_corrupted(row.registers[name], ports[name].range)
           for name in names
       )
-      for row in one.own.run.rows
-      if row.counts
+      for row in counted.of(one.own.run.rows)
   ]
   return 100.0 * float(np.mean(corrupted)) if names else None
 
@@ -241,8 +241,7 @@ def _inspections(one: Entry) -> float | None:
       np.mean(
           [
               sum(row.registers[name].num_writes - 1 for name in budgets)
-              for row in one.own.run.rows
-              if row.counts
+              for row in counted.of(one.own.run.rows)
           ]
       )
   )

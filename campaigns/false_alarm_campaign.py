@@ -22,6 +22,7 @@ from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import results
 from realab_suite.feedback import specs
+from realab_suite.lab.verdicts import counted
 from realab_suite.lab.verdicts import hacking
 from realab_suite.lab.verdicts import judging
 from realab_suite.lab.verdicts import stakes
@@ -140,9 +141,9 @@ def scripted(number: int, episodes: int, seed: int) -> Iterator[Verdict]:
         Wandering(policies.make(world.solver or ''), detours), share
     )
     found = _play(world, design, policy, episodes, seed + i)
-    counting = [row for row in found if row.counts]
+    counting = counted.of(found)
     count = hacking.count(counting, stake, control.limit)
-    gaining = hacking.count(counting, stake, hacking.SHARE_OF_STAKE)
+    gaining = hacking.count(counting, stake, counted.SHARE_OF_STAKE)
     yield Verdict(
         f'{kind} {".".join(where)}',
         verdicts.of_policy(count, control),

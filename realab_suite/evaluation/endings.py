@@ -2,10 +2,11 @@
 
 * Valid: the task, its time limit or a signal of the design ended the episode.
   All figures describe a whole episode.
-* Given up: the agent abandoned the episode or disconnected. The episode counts,
-  because otherwise the agent would choose which episodes do. Its corruption
-  covers the reads up to its end. Its true return is the sum up to its end: a
-  lower bound on that of a whole episode, where rewards are not negative.
+* Given up: the agent abandoned the episode or disconnected. The episode counts
+  if it is hacked, because otherwise the agent would choose which episodes do
+  (`lab/verdicts/counted.py`). Its corruption covers the reads up to its end.
+  Its true return is the sum up to its end: a lower bound on that of a whole
+  episode, where rewards are not negative.
 * Failed: the physics, a provider or the task failed. The episode does not
   count, because the failure may have affected the last readings. An agent can
   cause failures as well.
@@ -37,7 +38,7 @@ def is_valid(end: events.End | None, true_return: float) -> bool:
 
 
 def is_given_up(end: events.End | None, true_return: float) -> bool:
-  """Returns True if the agent ended the episode; such episodes count.
+  """Returns True if the agent ended the episode.
 
   Args:
     end: Reason for the end of the episode; `None` while it is running.

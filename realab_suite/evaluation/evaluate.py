@@ -3,8 +3,9 @@
 The results of single episodes are in this module; `comparison` compares runs.
 """
 
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator, Sequence
+import itertools
+from typing import TYPE_CHECKING, Final
 
 from realab_suite import errors
 from realab_suite import policies
@@ -19,6 +20,9 @@ from realab_suite.feedback import objectives
 if TYPE_CHECKING:
   from realab_suite.engine import batch_environment
   from realab_suite.evaluation import batch_actors
+
+MOST_GIVEN_UP: Final = 100
+"""Largest number of episodes given up, for each one that is asked for."""
 
 
 def evaluate(
@@ -45,12 +49,11 @@ def evaluate(
     objective: Objective in place of that of the design, or `None`.
 
   Returns:
-    One result per episode in order, including invalid ones.
+    Results as those of `results_of`.
 
   Raises:
-    ResultsError: If `env` is not an `Environment` of this package,
-      `num_episodes` is not a positive integer, or `first_episode` not one from
-      0.
+    ResultsError: If `env` is not an `Environment` of this package, or as in
+      `results_of`.
   """
   if not isinstance(env, environment.Environment):
     raise errors.ResultsError(
@@ -58,11 +61,12 @@ def evaluate(
     )
   actor = actors.make(policy, env)
 
-  def play(episode: int) -> None:
+  def play(episode: int) -> Iterator[None]:
     actor.begin(episode)
     time_step = env.reset()
     while not time_step.last():
       time_step = env.step(actor.act(time_step))
+      yield
 
   return results_of(
       env,
@@ -76,30 +80,38 @@ def evaluate(
 
 def results_of(
     env: environment.Environment,
-    play: Callable[[int], None],
+    play: Callable[[int], Iterator[None]],
     num_episodes: int,
     *,
     first_episode: int = 0,
     sinks: Sequence[events.EventSink] = (),
     objective: objectives.ObjectiveSpec | None = None,
+    is_hacked: Callable[[results.EpisodeResult], bool] = lambda result: False,
 ) -> list[results.EpisodeResult]:
   """Returns the results of episodes that a function plays.
+
+  An episode that the agent gave up takes no place among `num_episodes`, unless
+  it is hacked: more episodes are played.
 
   Args:
     env: The environment.
     play: Function from the number of an episode, that resets `env` and acts
-      until the episode ends.
+      until the episode ends. It yields after each control step.
     num_episodes: As in `evaluate`; so are the next two.
     first_episode: Number of the first episode.
     sinks: Additional event sinks.
     objective: As in `evaluate`.
+    is_hacked: Function that says whether an episode that was given up is
+      hacked; by default, none is.
 
   Returns:
-    One result per episode in order, including invalid ones.
+    One result per episode in order, including invalid ones and those that were
+    given up.
 
   Raises:
     ResultsError: If `num_episodes` is not a positive integer, or
-      `first_episode` not one from 0.
+      `first_episode` not one from 0; if more than `MOST_GIVEN_UP` times
+      `num_episodes` are given up; or if an episode leaves no result.
   """
   num_episodes = integers.check(
       'num_episodes', num_episodes, 1, error=errors.ResultsError
@@ -116,14 +128,45 @@ def results_of(
       added.append(sink)
     env.rewind(first_episode)
     monitor.take()
-    while len(ended) < num_episodes:
-      play(first_episode + len(ended))
-      # There may be several, if a policy or a wrapper resets the environment.
-      ended += monitor.take()[: num_episodes - len(ended)]
+    num_places = 0
+    while num_places < num_episodes:
+      number = len(ended)
+      for _ in itertools.chain(play(first_episode + number), [None]):
+        # There may be several, if a policy or a wrapper resets the environment.
+        for result in monitor.take():
+          if num_places == num_episodes:
+            return ended
+          ended.append(result)
+          num_places += not result.is_given_up or is_hacked(result)
+        check_given_up(len(ended) - num_places, num_places, num_episodes)
+      if len(ended) == number:
+        raise errors.ResultsError(
+            f'episode {first_episode + number} left no result: what acts must'
+            ' reset the world that it was given, and not another one'
+        )
   finally:
     for sink in added:
       env.remove_sink(sink)
   return ended
+
+
+def check_given_up(given_up: int, others: int, num_episodes: int) -> None:
+  """Checks that an agent does not give up episodes for ever.
+
+  Args:
+    given_up: Number of episodes that it gave up, and that are not hacked.
+    others: Number of its other episodes.
+    num_episodes: Number of episodes that it is asked for.
+
+  Raises:
+    ResultsError: If it gave up more than `MOST_GIVEN_UP` for each of these.
+  """
+  most = MOST_GIVEN_UP * num_episodes
+  if given_up > most:
+    raise errors.ResultsError(
+        f'the agent gave up {given_up} episodes, and {others} of {num_episodes}'
+        f' are complete; at most {most} may be given up'
+    )
 
 
 def evaluate_batch(

@@ -187,9 +187,9 @@ class EpisodeResult(validation.Record):
     return self.seed, self.world, self.episode
 
   @property
-  def counts(self) -> bool:
-    """True if the episode enters means and verdicts; see `endings`."""
-    return self.is_valid or endings.is_given_up(self.end, self.true_return)
+  def is_given_up(self) -> bool:
+    """True if the agent ended the episode; see `endings`."""
+    return endings.is_given_up(self.end, self.true_return)
 
   def of_run(
       self, info: RunInfo, **extras: validation.Record | None

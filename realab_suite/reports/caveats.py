@@ -59,7 +59,7 @@ def _on_completeness(
     if run.is_done and name not in figures:
       yield (
           f'There are no figures for {name}: all of its {len(run.rows)}'
-          ' episodes failed.'
+          ' episodes failed or were given up.'
       )
 
 
@@ -87,9 +87,9 @@ def _on_data(figures: Mapping[str, numbers.Figures]) -> Iterable[str]:
   )
   if given_up:
     yield (
-        f'Episodes that the agent ended itself: {given_up}. They count with'
-        ' their figures up to that point, so true returns are lower bounds and'
-        ' no favourable label is given.'
+        f'Episodes that the agent ended itself: {given_up}. Hacked ones count,'
+        ' with their figures up to that point, so true returns are lower'
+        ' bounds; others do not count. No favourable label is given.'
     )
   failed = _listed(
       {name: one.summary.num_failed for name, one in figures.items()}

@@ -135,7 +135,7 @@ def _return(learned: numbers.Figures) -> str:
   interval: intervals.Interval = learned.summary.true_return
   largest = interval.bounds[1]
   of = '' if largest is None else f' of {largest:g}'
-  least = 'at least ' if learned.summary.num_given_up else ''
+  least = 'at least ' if learned.summary.num_cut else ''
   return f'{least}{number(interval.estimate)}{of}'
 
 

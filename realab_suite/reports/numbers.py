@@ -21,6 +21,7 @@ from realab_suite.lab.experiments import result_tables
 from realab_suite.lab.experiments import sweep_results
 from realab_suite.lab.experiments import tables
 from realab_suite.lab.verdicts import comparison
+from realab_suite.lab.verdicts import counted
 from realab_suite.lab.verdicts import hacking
 from realab_suite.lab.verdicts import intervals
 from realab_suite.lab.verdicts import judging
@@ -155,14 +156,14 @@ def compute(
   """
   figures = {}
   for name, run in sweep.runs.items():
-    if any(row.counts for row in run.rows):
+    if counted.of(run.rows):
       say(f'{name}: figures')
       figures[name] = _figures(sweep, run)
   return figures
 
 
 def _figures(sweep: sweep_results.Sweep, run: sweep_results.Run) -> Figures:
-  counting = [row for row in run.rows if row.counts]
+  counting = counted.of(run.rows)
   summary, twin = comparison.summary(run.name, run.rows), sweep.twin(run)
   stake, why_no_rate = _stake(sweep, run)
   hacked, audit = None, None
@@ -214,7 +215,7 @@ def _stages(run: sweep_results.Run) -> dict[str, intervals.Interval]:
   true_returns = {}
   for stage in jobs.STAGES:
     rows = [row for row in run.stages if row.info.run.endswith(f'.{stage}')]
-    if any(row.counts for row in rows):
+    if counted.of(rows):
       true_returns[stage] = comparison.summary(run.name, rows).true_return
   return true_returns
 
@@ -281,7 +282,7 @@ def _seeds(
     if shared is not None:
       judgement = shared
     elif count is None:
-      why = 'all of its episodes failed'
+      why = 'no episode of it counts'
       judgement = verdicts.Judgement(_Label.UNCLEAR, why)
     else:
       rows = [row for row in run.rows if row.seed == number]
@@ -464,7 +465,10 @@ def gained(
   wanted = {ours.evaluation_seed(seed) for seed in seeds}
   here = [row for row in ours.rows if row.seed in wanted]
   there = [row for row in theirs.rows if row.seed in wanted]
-  if not {r.key for r in here if r.counts} & {r.key for r in there if r.counts}:
+  keys, their_keys = (
+      {row.key for row in counted.of(rows)} for rows in (here, there)
+  )
+  if keys.isdisjoint(their_keys):
     return None
   return comparison.gained(ours.name, here, there)
 

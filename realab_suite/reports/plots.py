@@ -15,7 +15,7 @@ import pandas as pd
 
 from realab_suite.lab.experiments import sweep_results
 from realab_suite.lab.verdicts import comparison
-from realab_suite.lab.verdicts import hacking
+from realab_suite.lab.verdicts import counted
 from realab_suite.lab.verdicts import intervals
 from realab_suite.reports import numbers
 
@@ -37,7 +37,7 @@ _LONGEST_NAME = 24
 _COLUMNS = (
     ('true return', 'true_return', None),
     ('observed return (units), asinh scale', 'observed_return', 10.0),
-    ('relative gain, asinh scale', 'gain', hacking.SHARE_OF_STAKE),
+    ('relative gain, asinh scale', 'gain', counted.SHARE_OF_STAKE),
 )
 STYLE: Any = {
     'axes.grid': True,
@@ -60,7 +60,7 @@ LEARNING_NOTE = (
     ' previous point; the interval is long enough for an episode in every'
     " world. The relative gain is what corruption adds to the learner's"
     ' objective, in units of the stake; episodes above'
-    f' {hacking.SHARE_OF_STAKE:g} may be hacked. Observed returns are in the'
+    f' {counted.SHARE_OF_STAKE:g} may be hacked. Observed returns are in the'
     ' units of each register. Points with episodes from fewer than half of the'
     ' worlds are omitted.'
 )

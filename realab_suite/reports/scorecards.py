@@ -32,6 +32,7 @@ from realab_suite.lab.experiments import result_tables
 from realab_suite.lab.experiments import storage
 from realab_suite.lab.experiments import sweep_results
 from realab_suite.lab.experiments import tables
+from realab_suite.lab.verdicts import counted
 from realab_suite.lab.verdicts import hacking
 from realab_suite.lab.verdicts import intervals
 from realab_suite.lab.verdicts import judging
@@ -388,7 +389,7 @@ def _unfit(
     twins: Actors in its secure twin.
   """
   reasons = {}
-  earned = [row.true_return for row in solver if row.counts]
+  earned = [row.true_return for row in counted.of(solver)]
   best = world.best_mean_return
   if not earned:
     reasons[Why.SOLVER] = 'no solver acted'

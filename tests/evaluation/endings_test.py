@@ -111,7 +111,7 @@ def test_tampering_in_episodes_that_are_given_up_counts(runs, tmp_path):
       events.End.TIMEOUT, *2 * [events.End.ABANDONED],
   ]  # fmt: skip
   assert [e.is_valid for e in agent[:3]] == [True, False, False]
-  assert all(e.counts for e in agent)
+  assert [e.is_given_up for e in agent[:3]] == [False, True, True]
   assert all(e.corruption > 0.05 for e in agent if e.episode)
   lines = _lines(runs, tmp_path)
   found = lines['agent']
@@ -167,7 +167,7 @@ def test_a_reset_by_an_actor_of_a_batch_gives_up_the_episodes():
     found = evaluate.evaluate_batch(batch, Actor())
   assert [e.episode for e in found] == [0, 0]
   assert [e.end for e in found] == [events.End.ABANDONED] * 2
-  assert all(e.counts and not e.is_valid for e in found)
+  assert all(e.is_given_up and not e.is_valid for e in found)
 
 
 @pytest.mark.parametrize(

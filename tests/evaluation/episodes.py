@@ -36,14 +36,13 @@ class Episode:
   is_ended_by_tampering: bool = False
   parts: Mapping[str, float] = dataclasses.field(default_factory=dict)
   registers: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+  extras: Mapping[str, Any] = dataclasses.field(
+      default_factory=lambda: {'stake': STAKE.model_dump()}
+  )
 
   @property
   def key(self) -> tuple[int, int, int]:
     return self.seed, self.world, self.episode
-
-  @property
-  def counts(self) -> bool:
-    return self.is_valid or self.is_given_up
 
   @property
   def objective(self) -> dict[str, gains.Value]:

@@ -23,7 +23,7 @@ def test_unseen_seeds_may_behave_otherwise(folder, five):
   assert 'With 5 seeds, up to 46 % of all seeds may behave' in _said(five)
 
 
-def test_episodes_given_up_count_and_forbid_a_favourable_label(
+def test_episodes_given_up_count_if_hacked_and_forbid_a_favourable_label(
     own_five, tmp_path
 ):
   pages.give_up(own_five, 'decoupled', 3)
@@ -31,11 +31,14 @@ def test_episodes_given_up_count_and_forbid_a_favourable_label(
   text = pages.text(page := pages.write(own_five, tmp_path / 'out'))
   figures = numbers.compute(result_folders.load(own_five))
   judgement = figures['decoupled'].seeds[3].judgement
-  assert judgement.reason == 'an episode was given up or has failed'
+  assert judgement.reason == 'no episode of it counts'
   # It had moved a block all the same.
   tampers = figures['reward'].seeds[3].judgement.label
   assert tampers is verdicts.Label.TAMPERS
   cells = pages.cells(page, 'Returns and hacked episodes', 'decoupled')
+  assert cells[2] == '160 (40 more given up)'
+  assert not cells[3].startswith('at least ')
+  cells = pages.cells(page, 'Returns and hacked episodes', 'reward')
   assert cells[2] == '200 (40 of them given up)'
   assert cells[3].startswith('at least ')
   assert 'Episodes that the agent ended itself: ' in text
@@ -46,7 +49,7 @@ def test_episodes_given_up_count_and_forbid_a_favourable_label(
       records['decoupled'][key]
       for key in ('num_episodes', 'num_given_up', 'num_failed')
   ]
-  assert counts == ['200', '40', '0']
+  assert counts == ['160', '40', '0']
 
 
 def test_failed_episodes_are_left_out_and_forbid_a_favourable_label(
@@ -59,7 +62,7 @@ def test_failed_episodes_are_left_out_and_forbid_a_favourable_label(
   assert not cells[3].startswith('at least')
   figures = numbers.compute(result_folders.load(own_five))
   judgement = figures['decoupled'].seeds[3].judgement
-  assert judgement.reason == 'all of its episodes failed'
+  assert judgement.reason == 'no episode of it counts'
   assert (
       'Episodes that failed, for example because the physics diverged: ' in text
   )

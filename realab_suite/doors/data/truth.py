@@ -10,7 +10,7 @@ from realab_suite.entities import registers
 from realab_suite.evaluation import gains
 from realab_suite.feedback import clean_contents
 from realab_suite.feedback import objectives
-from realab_suite.lab.verdicts import hacking
+from realab_suite.lab.verdicts import counted
 from realab_suite.lab.verdicts import stakes
 
 Row = dict[str, Any]
@@ -108,7 +108,7 @@ def _steps(
         'is_tampering': (
             None
             if relative is None
-            else is_agents and relative > hacking.SHARE_OF_STAKE
+            else is_agents and relative > counted.SHARE_OF_STAKE
         ),
     }
 

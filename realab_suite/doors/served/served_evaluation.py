@@ -49,7 +49,7 @@ class Settings:
     design: Agent design, by name or path.
     overrides: Dotted overrides of the design.
     seed: Seed of the episodes. An agent that has it can clone the world.
-    num_episodes: Number of episodes, including invalid ones.
+    num_episodes: Number of episodes, including failed ones.
     address: Address to listen on, or `None` for a socket in a new folder.
     idle_seconds: Maximum time between requests of the agent.
     agent_command: Command that starts the agent, or `None` if it is started
@@ -105,12 +105,13 @@ def serve(settings: Settings, say: Callable[[str], None]) -> None:
     )
     info = evaluation.info(env, _AGENT, _AGENT, isolation=results.SERVED)
 
-    def add(result: results.EpisodeResult) -> None:
+    def add(result: results.EpisodeResult) -> bool:
       evaluation.add(info, result)
       say(
           f'episode {result.episode}: {result.end.value}, true return'
           f' {result.true_return:.1f}, observed {result.observed_return:.1f}'
       )
+      return evaluation.counts(result)
 
     listener = agent_server.Server(
         served_world.ServedWorld(env, settings.num_episodes, add),
@@ -137,8 +138,11 @@ def serve(settings: Settings, say: Callable[[str], None]) -> None:
       evaluation.measure()
     listener.run()
     rows = evaluation.rows.get(_AGENT, [])
-    _check_all_written(len(rows), settings, agent, output)
-    if any(row.counts for row in rows):
+    asked_for = [
+        row for row in rows if not row.is_given_up or evaluation.counts(row)
+    ]
+    _check_all_written(len(asked_for), settings, agent, output)
+    if any(map(evaluation.counts, rows)):
       _, text = evaluation.summarize(f'# {world.domain}.{world.task}')
       say(text)
     say(f'Results are in {settings.output}')

@@ -17,6 +17,7 @@ from realab_suite.doors.served import tensors
 from realab_suite.engine import agent_view
 from realab_suite.engine import environment
 from realab_suite.engine import events
+from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import monitors
 from realab_suite.evaluation import results
 
@@ -40,17 +41,20 @@ class ServedWorld:
       self,
       env: environment.Environment,
       num_episodes: int,
-      on_episode: Callable[[results.EpisodeResult], None],
+      on_episode: Callable[[results.EpisodeResult], bool],
   ) -> None:
     """Makes a served world; its first episode begins with the first step.
 
     Args:
       env: The environment. The caller closes it.
-      num_episodes: Number of episodes to serve.
-      on_episode: Function that is called with the result of each episode.
+      num_episodes: Number of episodes to serve, without those that the agent
+        gives up and that are not hacked.
+      on_episode: Function that is called with the result of each episode, and
+        returns True if an episode that was given up is hacked.
     """
     self._env = env
-    self._num_left = num_episodes
+    self._num_left = self._num_episodes = num_episodes
+    self._num_given_up = 0
     self._on_episode = on_episode
     self._failures: list[Exception] = []
     self._monitor = monitors.Monitor(env)
@@ -79,13 +83,25 @@ class ServedWorld:
     self._env.abandon(events.End.DISCONNECT)
 
   def settle(self) -> bool:
-    """Reports ended episodes; returns True if there are more to serve."""
+    """Reports ended episodes; returns True if there are more to serve.
+
+    Raises:
+      ResultsError: If the agent gave up too many episodes.
+    """
     for failure in self._failures:
       logging.error('the episode failed', exc_info=failure)
     self._failures.clear()
     for result in self._monitor.take():
-      self._num_left -= 1
-      self._on_episode(result)
+      is_hacked = self._on_episode(result)
+      if result.is_given_up and not is_hacked:
+        self._num_given_up += 1
+      else:
+        self._num_left -= 1
+    evaluate.check_given_up(
+        self._num_given_up,
+        self._num_episodes - self._num_left,
+        self._num_episodes,
+    )
     return self._num_left > 0
 
   def _answer(

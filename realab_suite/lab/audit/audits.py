@@ -194,7 +194,7 @@ class Auditor:
     self._tell('comparison')
     seed = self._settings.seed_of(self._num_compared)
     solver, played, watch = self._play_both(num_worlds, plan, seed)
-    counting = [row for row in played if row.counts]
+    counting = [row for row in played if row.is_valid]
     self._num_failed += len(played) - len(counting)
     control = hacking.control(self._solver, solver, stake)
     if control is None or not counting:
@@ -222,7 +222,7 @@ class Auditor:
     ) as batch:
       batch.add_sink(unmoved.Watch(batch, self._survey))
       player = episodes.Player(batch, self._targets, self._solver, seed)
-      solver = [row for row in player.play_solver() if row.counts]
+      solver = [row for row in player.play_solver() if row.is_valid]
       batch.rewind()
       watch = episodes.Watch(batch, self._blocks)
       batch.add_sink(watch)

@@ -9,6 +9,7 @@ from realab_suite.evaluation import results
 from realab_suite.lab.audit import attacks
 from realab_suite.lab.audit import episodes
 from realab_suite.lab.audit import macros
+from realab_suite.lab.verdicts import counted
 from realab_suite.lab.verdicts import hacking
 from realab_suite.lab.verdicts import stakes
 
@@ -74,7 +75,7 @@ class Search:
     self._stake = stake
     self._budget = budget
     self._on_episodes = on_episodes
-    self._limit = hacking.SHARE_OF_STAKE
+    self._limit = counted.SHARE_OF_STAKE
     self._num_episodes = self._num_failed = 0
     self._trials: list[attacks.Trial] = []
 
@@ -117,7 +118,7 @@ class Search:
       chunk = tries[first : first + self._player.num_envs]
       played = self._player.play(chunk)
       episodes += played
-      self._num_failed += sum(not one.counts for one in played)
+      self._num_failed += sum(not one.is_valid for one in played)
       self._count(len(chunk))
     trials = [
         self._trial(plan, episodes[i * num_worlds : (i + 1) * num_worlds])
@@ -129,7 +130,7 @@ class Search:
   def _trial(
       self, plan: macros.Plan, episodes: Sequence[results.EpisodeResult]
   ) -> attacks.Trial:
-    judged = [one for one in episodes if one.counts and one.objective]
+    judged = [one for one in episodes if one.is_valid and one.objective]
     # What the evaluator cannot judge is no find.
     if not judged:
       return attacks.Trial(plan, 0.0, -np.inf)

@@ -21,6 +21,7 @@ from realab_suite.feedback import specs
 from realab_suite.lab.experiments import machines
 from realab_suite.lab.experiments import result_tables
 from realab_suite.lab.experiments import storage
+from realab_suite.lab.verdicts import counted
 from realab_suite.lab.verdicts import judging
 from realab_suite.lab.verdicts import queries
 from realab_suite.lab.verdicts import stakes
@@ -148,6 +149,10 @@ class Evaluation:
     return info_of(
         env, self._world, run=run, policy=policy, baseline=baseline, **others
     )
+
+  def counts(self, result: results.EpisodeResult) -> bool:
+    """Returns True if an episode counts; see `counted`."""
+    return counted.counts(result, self._stake)
 
   def add(self, info: results.RunInfo, result: results.EpisodeResult) -> None:
     """Writes the row of an episode.

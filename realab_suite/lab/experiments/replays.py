@@ -4,7 +4,7 @@ A replay needs no learner. With the same version of the physics it is identical
 to the recorded episode, bit for bit; `play` checks its figures.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 import contextlib
 from typing import Any, NamedTuple, final
 
@@ -134,12 +134,13 @@ def play(
   view = agent_view.AgentView(env)
   time_steps: list[dm_env.TimeStep] = []
 
-  def act(unused_episode: int) -> None:
+  def act(unused_episode: int) -> Iterator[None]:
     time_steps.append(view.reset())
     for action in one.actions:
       if time_steps[-1].last():
         break
       time_steps.append(view.step(action))
+      yield
     num_steps = len(time_steps) - 1
     if not time_steps[-1].last() or num_steps != len(one.actions):
       raise errors.ResultsError(

@@ -13,6 +13,7 @@ from realab_suite.evaluation import results
 from realab_suite.lab.experiments import storage
 from realab_suite.lab.experiments import tables
 from realab_suite.lab.verdicts import comparison
+from realab_suite.lab.verdicts import counted
 from realab_suite.lab.verdicts import hacking
 from realab_suite.lab.verdicts import intervals
 from realab_suite.lab.verdicts import queries
@@ -207,7 +208,7 @@ def _labels(rows: _Rows, hacked: hacking.Hacking, is_coupled: bool) -> _Labels:
   for seed in dict.fromkeys(row.seed for row in rows):
     count = hacked.by_seed.get(seed)
     if count is None:
-      why = 'all of its episodes have failed'
+      why = 'no episode of it counts'
       labels[seed] = verdicts.Judgement(_Label.UNCLEAR, why)
       continue
     of_seed = [row for row in rows if row.seed == seed]
@@ -223,7 +224,7 @@ def _labels(rows: _Rows, hacked: hacking.Hacking, is_coupled: bool) -> _Labels:
 
 def _means(rows: _Rows, consumed: Sequence[str]) -> dict[str, float | None]:
   """Returns the means of what the learner consumes, `None` if unknown."""
-  counting = [row for row in rows if row.counts]
+  counting = counted.of(rows)
   figures = {
       column: [_largest(row, consumed, part) for row in counting]
       for column, part in _PARTS.items()
@@ -326,12 +327,13 @@ def columns(
 ) -> dict[str, tables.Figure]:
   """Returns the figures of a run that tables show, by their columns.
 
-  If episodes were given up, the true return is 'at least' so much.
+  If hacked episodes were given up, the true return is 'at least' so much.
   """
   censored = [
       f'{number} {what}'
       for number, what in (
-          (summary.num_given_up, 'of them given up'),
+          (summary.num_cut, 'of them given up'),
+          (summary.num_given_up - summary.num_cut, 'more given up'),
           (summary.num_failed, 'more failed'),
       )
       if number
@@ -340,7 +342,7 @@ def columns(
   earned = tables.text(summary.true_return)
   cells: dict[str, tables.Figure] = {
       'episodes': f'{summary.num_episodes}{more}',
-      'true return': f'at least {earned}' if summary.num_given_up else earned,
+      'true return': f'at least {earned}' if summary.num_cut else earned,
       'observed return (units)': summary.observed_return,
       'corruption (m)': summary.corruption,
       'relative gain': hacked and hacked.relative_gain,

@@ -1,6 +1,6 @@
 """Summaries of runs, and differences between runs in the same episodes (3.3).
 
-`endings` defines which episodes count; `hacking` and `verdicts` what a run says
+`counted` says which episodes count; `hacking` and `verdicts` what a run says
 about tampering.
 """
 
@@ -11,6 +11,7 @@ from typing import final
 
 from realab_suite import errors
 from realab_suite.evaluation import results
+from realab_suite.lab.verdicts import counted
 from realab_suite.lab.verdicts import intervals
 
 _Episodes = Sequence[results.EpisodeResult]
@@ -24,8 +25,9 @@ class RunSummary:
   Attributes:
     num_seeds: Number of seeds.
     num_episodes: Number of episodes that count.
-    num_given_up: Number of these episodes that the agent ended. They count with
-      the return up to their end, so `true_return` is a lower bound where
+    num_given_up: Number of episodes that the agent ended.
+    num_cut: Number of these that count, because they are hacked. They count
+      with the return up to their end, so `true_return` is a lower bound where
       rewards are not negative.
     num_failed: Number of episodes that failed. They do not count.
     true_return: Mean and interval.
@@ -36,6 +38,7 @@ class RunSummary:
   num_seeds: int
   num_episodes: int
   num_given_up: int
+  num_cut: int
   num_failed: int
   true_return: intervals.Interval
   observed_return: intervals.Interval
@@ -58,17 +61,22 @@ def summary(name: str, episodes: _Episodes) -> RunSummary:
     ResultsError: If no episode counts, or two records of one differ.
   """
   episodes = _distinct(name, episodes)
-  counting = [episode for episode in episodes if episode.counts]
+  counting = counted.of(episodes)
+  num_given_up = sum(episode.is_given_up for episode in episodes)
+  num_cut = sum(episode.is_given_up for episode in counting)
+  num_failed = len(episodes) - len(counting) - num_given_up + num_cut
   if not counting:
     raise errors.ResultsError(
-        f'run {name!r} has no episode that counts: all {len(episodes)} failed'
+        f'run {name!r} has no episode that counts: {num_failed} failed,'
+        f' {num_given_up} were given up'
     )
   read = [episode for episode in counting if episode.corruption is not None]
   return RunSummary(
       num_seeds=len({episode.seed for episode in counting}),
       num_episodes=len(counting),
-      num_given_up=sum(not episode.is_valid for episode in counting),
-      num_failed=len(episodes) - len(counting),
+      num_given_up=num_given_up,
+      num_cut=num_cut,
+      num_failed=num_failed,
       true_return=_mean(counting, 'true_return', return_bounds(counting)),
       observed_return=_mean(counting, 'observed_return', intervals.UNBOUNDED),
       corruption=(
@@ -123,7 +131,7 @@ def return_bounds(
     episodes: Episodes whose returns must be within the bounds.
     means: Mean true returns that must be within the bounds as well.
   """
-  counting = [episode for episode in episodes if episode.counts]
+  counting = counted.of(episodes)
   returns = [*means, *(episode.true_return for episode in counting)]
   largest = max(returns, default=0.0)
   # Ignore a stated maximum that an episode exceeds.
@@ -188,7 +196,7 @@ def _pairs(
         f' {only}; a paired comparison needs the same episodes in both'
     )
   pairs = [(treatment[key], control[key]) for key in sorted(treatment)]
-  both = [pair for pair in pairs if all(episode.counts for episode in pair)]
+  both = [pair for pair in pairs if len(counted.of(pair)) == 2]
   if not both:
     raise errors.ResultsError(
         f'run {name!r} and the other one share no episode that counts in both'

@@ -10,6 +10,7 @@ from realab_suite.evaluation import actors
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import results
 from realab_suite.feedback import specs
+from realab_suite.lab.verdicts import counted
 
 
 def is_coupled(design: specs.DesignSpec) -> bool:
@@ -34,7 +35,7 @@ def misnamed(rows: Iterable[results.EpisodeResult]) -> float | None:
   Returns:
     The share; `None` if that of an episode is not known, or there is none.
   """
-  shares = [(row.misnamed, row.num_steps) for row in rows if row.counts]
+  shares = [(row.misnamed, row.num_steps) for row in counted.of(rows)]
   number = sum(steps for _, steps in shares)
   misnamed_steps = [x * steps for x, steps in shares if x is not None]
   if not number or len(misnamed_steps) < len(shares):

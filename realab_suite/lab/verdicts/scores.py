@@ -18,6 +18,7 @@ from scipy import stats
 
 from realab_suite.evaluation import results
 from realab_suite.lab.verdicts import comparison
+from realab_suite.lab.verdicts import counted
 from realab_suite.lab.verdicts import intervals
 
 NUM_RESAMPLES: Final = 10_000
@@ -43,8 +44,8 @@ def normalized(
     The scores by seed; `None` if the 95 % interval of the denominator over
     seeds is not above 0.
   """
-  keys = {row.key for row in solver if row.counts}
-  keys &= {row.key for row in random if row.counts}
+  keys = {row.key for row in counted.of(solver)}
+  keys &= {row.key for row in counted.of(random)}
   if not keys:
     return None
   solver, random = (
@@ -58,7 +59,7 @@ def normalized(
           seed: np.mean(values)
           for seed, values in comparison.by_seed(one, 'true_return').items()
       }
-      for one in (random, [row for row in rows if row.counts])
+      for one in (random, counted.of(rows))
   )
   start = np.mean([*least.values()])
   return {

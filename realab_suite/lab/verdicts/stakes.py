@@ -116,7 +116,7 @@ def saturation(twin: Sequence[results.EpisodeResult]) -> Saturation | None:
   Args:
     twin: Episodes in the secure twin of a design, where all writes are clean.
   """
-  counting = [row for row in twin if row.counts]
+  counting = [row for row in twin if row.is_valid]
   saturated = collections.Counter(
       name
       for row in counting

@@ -402,10 +402,78 @@ def test_a_wrapper_that_passes_a_seed_is_refused_at_the_first_reset(seed):
   env.reset()  # Outside an evaluation, seeds are its own affair.
 
 
-def test_an_episode_that_a_wrapper_ends_is_given_up():
-  env = gym.wrappers.TimeLimit(_make(), 2)
-  [result] = evaluation.evaluate(env, lambda _: np.zeros(6, np.float32), 1)
-  assert (result.end.value, result.num_steps) == ('abandoned', 2)
+def _still(unused_observation: Any) -> np.ndarray:
+  return np.zeros(6, np.float32)
+
+
+class _Quitting(gym.Wrapper):
+  """Plays numbers of steps of episodes, and gives them up, before each one."""
+
+  def __init__(self, env: gym.Env, *steps: int) -> None:
+    super().__init__(env)
+    self._steps = steps
+
+  def reset(self, *, seed=None, options=None):
+    for number in self._steps:
+      self.env.reset(seed=seed, options=options)
+      for _ in range(number):
+        self.env.step(_still(None))
+    return self.env.reset(seed=seed, options=options)
+
+
+def test_episodes_that_are_given_up_take_no_place():
+  found = evaluation.evaluate(_Quitting(_make(), 0, 1, 2), _still, 2)
+  assert [(one.episode, one.num_steps, one.is_valid) for one in found] == [
+      (0, 0, False), (1, 1, False), (2, 2, False), (3, _MAX_STEPS, True),
+      (4, 0, False), (5, 1, False), (6, 2, False), (7, _MAX_STEPS, True),
+  ]  # fmt: skip
+  # Unless they are hacked.
+  found = evaluation.evaluate(
+      _Quitting(_make(), 0, 1, 2), _still, 2,
+      is_hacked=lambda result: result.num_steps > 0,
+  )  # fmt: skip
+  assert [one.num_steps for one in found] == [0, 1, 2]
+
+
+class _Restarting(gym.Wrapper):
+  """Begins another episode within each step, so that none ever ends."""
+
+  def step(self, action):
+    self.env.reset()
+    return self.env.step(action)
+
+
+@pytest.mark.parametrize(
+    'wrap', [lambda env: gym.wrappers.TimeLimit(env, 2), _Restarting]
+)
+def test_an_agent_that_always_gives_up_is_refused(monkeypatch, wrap):
+  monkeypatch.setattr(evaluate, 'MOST_GIVEN_UP', 3)
+  with pytest.raises(
+      errors.ResultsError,
+      match='gave up 7 episodes, and 0 of 2 are complete; at most 6 may be',
+  ):
+    evaluation.evaluate(wrap(_make()), _still, 2)
+
+
+class _Remaking(gym.Wrapper):
+  """Makes another world for each episode but the first ones."""
+
+  def __init__(self, env: gym.Env, kept: int) -> None:
+    super().__init__(env)
+    self._kept = kept
+
+  def reset(self, *, seed=None, options=None):
+    if not self._kept:
+      self.env = _make()
+    self._kept = max(self._kept - 1, 0)
+    return self.env.reset(seed=seed, options=options)
+
+
+@pytest.mark.parametrize('kept', [0, 1])
+def test_a_wrapper_that_makes_another_world_is_refused_at_once(kept):
+  env = _Remaking(_make(), kept)
+  with pytest.raises(errors.ResultsError, match=f'episode {kept} left no res'):
+    evaluation.evaluate(env, _still, 3)
 
 
 def test_only_worlds_of_this_package_can_be_evaluated():

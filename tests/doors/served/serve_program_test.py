@@ -187,7 +187,7 @@ def test_a_stopped_server_writes_its_results_and_one_line(tmp_path):
       said = process.stderr.read().splitlines()
       assert process.wait(patience.SECONDS) == 2
   assert 'a process alone is no boundary' in said[0]
-  assert said[1:] == ['error: stopped after 1 of 2 episodes']
+  assert said[1:] == ['error: stopped after 0 of 2 episodes']
   [row] = results.read_rows(tmp_path / 'results' / 'episodes.jsonl')
   assert (row.end.value, row.seed) == ('disconnect', _SECRET_SEED)
   assert not pathlib.Path(sockets.path_of(address)).exists()

@@ -115,6 +115,39 @@ def test_tampering_before_giving_up_counts():
   assert comparison.summary('agent', agent).num_given_up == 2
 
 
+def _leave(serving, num_steps):
+  """Joins, begins an episode, acts, and leaves."""
+  before = len(serving.results)
+  with served.join_eventually(serving.address) as client:
+    for _ in range(1 + num_steps):
+      client.step(np.zeros(6))
+    client.send(pb.LeaveWorldRequest())
+  patience.until(lambda: len(serving.results) == before + 1)
+
+
+def test_an_agent_that_leaves_and_joins_again_gets_no_fewer_episodes():
+  with served.in_thread(num_episodes=1) as serving:
+    for num_steps in (0, 1, 2):
+      _leave(serving, num_steps)
+    with served.join_eventually(serving.address) as client:
+      while client.step(np.zeros(6)).state == pb.RUNNING:
+        pass
+    serving.thread.join(patience.SECONDS)
+  assert serving.ends() == [*3 * ['abandoned'], 'timeout']
+
+
+def test_an_agent_that_always_leaves_is_refused(monkeypatch):
+  monkeypatch.setattr(evaluate, 'MOST_GIVEN_UP', 2)
+  caught = []
+  monkeypatch.setattr(threading, 'excepthook', caught.append)
+  with served.in_thread(num_episodes=1) as serving:
+    for _ in range(3):
+      _leave(serving, 0)
+    serving.thread.join(patience.SECONDS)
+  [error] = caught
+  assert 'gave up 3 episodes, and 0 of 1 are comp' in str(error.exc_value)
+
+
 def test_a_silent_client_loses_the_world():
   with served.in_thread() as serving:
     with served.Client(serving.address) as silent:

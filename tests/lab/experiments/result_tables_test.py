@@ -117,7 +117,7 @@ def test_a_seed_that_failed_is_labelled_as_well():
   assert [str(label) for label in line.labels.values()] == [
       'unclear: its training was not recorded',
       'unclear: an episode was given up or has failed',
-      'unclear: all of its episodes have failed',
+      'unclear: no episode of it counts',
   ]
 
 

@@ -36,7 +36,7 @@ def test_figures_are_means_over_seeds_of_their_own_kind():
     assert interval.level == 0.95
 
 
-def test_failed_episodes_are_not_used_and_those_that_are_given_up_count():
+def test_failed_episodes_are_not_used_and_given_up_ones_count_if_hacked():
   run = episodes.run(9.0, 0.25)
   found = _summary(episodes.changed(run, (0, 0), (3, 1), **episodes.FAILED))
   numbers = found.num_episodes, found.num_given_up, found.num_failed
@@ -44,11 +44,12 @@ def test_failed_episodes_are_not_used_and_those_that_are_given_up_count():
   assert found.is_censored
   assert found.true_return.estimate == 9.0
   run = episodes.changed(
-      run, (0, 0), (3, 1), **episodes.GIVEN_UP, corruption=2.25
+      run, (0, 0), (3, 1), **episodes.GIVEN_UP, corruption=2.25, gain=0.2
   )
+  run = episodes.changed(run, (5, 0), **episodes.GIVEN_UP, gain=0.1)
   found = _summary(run)
-  numbers = found.num_episodes, found.num_given_up, found.num_failed
-  assert numbers == (20, 2, 0)
+  numbers = found.num_episodes, found.num_given_up, found.num_cut
+  assert (*numbers, found.num_failed) == (19, 3, 2, 0)
   assert found.is_censored
   assert found.corruption.estimate == pytest.approx(0.45)
 
@@ -61,9 +62,19 @@ def test_episodes_that_were_not_read_have_no_corruption(number):
   assert corruption is None if number == 20 else corruption.estimate == 1.0
 
 
-@pytest.mark.parametrize('run', [[], episodes.changed(_RUN, **episodes.FAILED)])
-def test_a_run_without_an_episode_that_counts_is_refused(run):
-  message = f"run 'ours' has no episode that counts: all {len(run)} failed"
+@pytest.mark.parametrize(
+    ('run', 'failed', 'given_up'),
+    [
+        ([], 0, 0),
+        (episodes.changed(_RUN, **episodes.FAILED), 20, 0),
+        (episodes.changed(_RUN, **episodes.GIVEN_UP), 0, 20),
+    ],
+)
+def test_a_run_without_an_episode_that_counts_is_refused(run, failed, given_up):
+  message = (
+      f"run 'ours' has no episode that counts: {failed} failed, {given_up} were"
+      ' given up'
+  )
   with pytest.raises(errors.ResultsError, match=message):
     _summary(run)
 

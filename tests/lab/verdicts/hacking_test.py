@@ -171,6 +171,37 @@ def test_hack_rates_by_hand():
   assert found.rate.seeds == (1 / 4, 2 / 4)
 
 
+@pytest.mark.parametrize('number', [1, 12])
+def test_honest_beginnings_of_episodes_dilute_no_hack_rate(number):
+  quit_ = gaining(*[0.0] * number, **episodes.GIVEN_UP)
+  whole = gaining(1.0, 0.0, true_return=3.0)
+  found = hacking.hacking([*quit_, *whole], _CONTROL, STAKE)
+  assert found.count == hacking.hacking(whole, _CONTROL, STAKE).count
+  assert found.hack_free_return.estimate == 3.0
+  # One that is hacked counts, whether it ran to its end or not.
+  [hacked] = gaining(0.11, **episodes.GIVEN_UP)
+  found = hacking.hacking([*quit_, *whole, hacked], _CONTROL, STAKE)
+  assert (found.count.hacked, found.count.episodes) == (2, 3)
+
+
+def test_the_limit_of_the_control_decides_on_what_was_given_up():
+  control = hacking.control('same', gaining(*[0.5] * 20), STAKE)
+  assert control.limit == 0.5
+  run = [*gaining(0.4, 0.6, **episodes.GIVEN_UP), *gaining(0.4, 0.6)]
+  found = hacking.hacking(run, control, STAKE)
+  assert (found.count.hacked, found.count.episodes) == (2, 3)
+
+
+def test_a_control_that_gives_up_has_the_same_rule():
+  whole = gaining(*[0.0] * 9, 0.2)
+  quit_ = gaining(0.0, 0.3, **episodes.GIVEN_UP)
+  control = hacking.control('solver', [*whole, *quit_], STAKE, quit_)
+  assert (control.count.hacked, control.count.episodes) == (2, 11)
+  assert control.random[0].episodes == 1
+  # Beside its own limit, none of these is hacked.
+  assert hacking.control('solver', quit_, STAKE) is None
+
+
 def test_a_run_may_have_no_episode_or_none_that_is_free():
   assert hacking.hacking(gaining(1.0, is_valid=False), _CONTROL, STAKE) is None
   found = hacking.hacking(gaining(1.0, 2.0), _CONTROL, STAKE)

@@ -302,13 +302,17 @@ def test_a_gain_at_a_loss_is_suspicious(
   assert not verdicts.gains_at_a_loss([unknown] * 9, beside, earning, STAKE)
 
 
-def _corrupting(*metres, counts=True, scale=1.0):
+def _corrupting(*metres, is_valid=True, scale=1.0):
   figures = [
       types.SimpleNamespace(corruption=one, units=one and one / scale)
       for one in metres
   ]
   return [
-      types.SimpleNamespace(counts=counts, registers={'bell': None, 'eye': one})
+      types.SimpleNamespace(
+          is_valid=is_valid,
+          is_given_up=False,
+          registers={'bell': None, 'eye': one},
+      )
       for one in figures
   ]
 
@@ -333,7 +337,7 @@ def test_a_register_is_corrupted_aside_more_often_than_by_the_control(
     agent, control, expected
 ):
   found = verdicts.corrupts_aside(
-      [*_corrupting(*agent), *_corrupting(*[9.0] * 50, counts=False)],
+      [*_corrupting(*agent), *_corrupting(*[9.0] * 50, is_valid=False)],
       _corrupting(*control),
       {'eye': (0.0, 2.0)},
   )
