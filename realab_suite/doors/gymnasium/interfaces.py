@@ -1,7 +1,7 @@
 """Spaces, conversions and pictures: what one world and a batch share."""
 
-from collections.abc import Collection, Mapping
-from typing import Any, Literal, final
+from collections.abc import Callable, Collection, Mapping
+from typing import Any, Literal, TypeVar, final
 
 from realab_suite import errors
 from realab_suite.config import validation
@@ -16,6 +16,8 @@ _CAMERA = 'top_down'
 _SIZE = (240, 320)
 # MuJoCo's free camera.
 _FREE = -1
+
+_T = TypeVar('_T')
 
 
 @final
@@ -52,6 +54,29 @@ def check_names(given: Collection[str], allowed: Collection[str]) -> None:
     validation.check_keys(given, allowed, 'unexpected keyword argument')
   except ValueError as error:
     raise errors.UnknownOptionError(f'options: {error}') from None
+
+
+def shielded(call: Callable[[], _T]) -> _T:
+  """Calls a function that needs the environment, and not just its view.
+
+  Errors keep their class and their words, but no frames of the environment.
+
+  Args:
+    call: A function of the adapter. It must not be bound to the environment,
+      because this frame is in the traceback.
+
+  Raises:
+    RealabError: If the function fails; a `WorldError` for other exceptions.
+  """
+  problem: errors.RealabError
+  try:
+    return call()
+  except errors.RealabError as error:
+    problem = type(error)(str(error))
+  except Exception:  # Drivers may raise anything.
+    problem = errors.WorldError('the world failed')
+  # Raised outside the `try`, so it has no context.
+  raise problem
 
 
 @final

@@ -2,12 +2,15 @@
 
 from collections.abc import Iterator
 import contextlib
+import copy
 from typing import Any, final
 
 import gymnasium as gym
+from gymnasium.envs import registration
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.config import integers
 from realab_suite.config import messages
 from realab_suite.doors.gymnasium import codecs
 from realab_suite.doors.gymnasium import interfaces
@@ -79,7 +82,9 @@ class RealabEnv(agent_view.Uncopied, gym.Env):
       )
     super().reset(seed=seed, options=options)
     if seed is not None:
-      self._environment.rewind(random=seed)
+      # Code of the agent, such as `__index__`, runs before the environment's.
+      number = integers.check('seed', seed, 0, None)
+      interfaces.shielded(lambda: self._environment.rewind(random=number))
     time_step = self._view.reset()
     self._is_over = False
     return self._interface.observations.encode(time_step.observation), {}
@@ -118,10 +123,18 @@ class RealabEnv(agent_view.Uncopied, gym.Env):
     )
 
   def render(self) -> np.ndarray | None:
-    """Returns a frame for people, `(height, width, 3)` uint8, or `None`."""
+    """Returns a frame for people, `(height, width, 3)` uint8, or `None`.
+
+    Raises:
+      RenderingError: If no renderer is available, or if it fails.
+    """
     if self.render_mode is None:
       return None
-    return gl_contexts.frame(self._environment.physics, *self._interface.frame)
+    return interfaces.shielded(
+        lambda: gl_contexts.frame(
+            self._environment.physics, *self._interface.frame
+        )
+    )
 
   def close(self) -> None:
     """Frees the world. Closing it again has no effect."""
@@ -154,10 +167,38 @@ def environment_of(env: gym.Env) -> environment.Environment:
 
 @contextlib.contextmanager
 def keeping_seed(env: gym.Env) -> Iterator[None]:
-  """Returns a context in which resets of a `RealabEnv` with a seed fail."""
+  """Returns a context in which the seed of a `RealabEnv` is its own.
+
+  Resets with a seed fail. Neither the spec, which can make a clone, nor the
+  generator of the adapter says which seed it is.
+  """
   base: Any = env.unwrapped
-  before, base._keeps_seed = base._keeps_seed, True
+  kept = ('_keeps_seed', 'spec', '_np_random', '_np_random_seed')
+  before = {name: getattr(base, name) for name in kept}
+  base._keeps_seed, base.spec = True, _without_seed(base.spec)
+  base._np_random = base._np_random_seed = None
+  _forget_specs(env)
   try:
     yield
   finally:
-    base._keeps_seed = before
+    for name, value in before.items():
+      setattr(base, name, value)
+    _forget_specs(env)
+
+
+def _without_seed(spec: registration.EnvSpec | None) -> Any:
+  """Returns the spec of a world without its seed."""
+  if spec is None:
+    return None
+  spec = copy.deepcopy(spec)
+  task_kwargs = dict(spec.kwargs.get('task_kwargs') or {})
+  task_kwargs.pop('random', None)
+  spec.kwargs['task_kwargs'] = task_kwargs
+  return spec
+
+
+def _forget_specs(env: Any) -> None:
+  """Makes wrappers compute their specs anew."""
+  while isinstance(env, gym.Wrapper):
+    env._cached_spec = None
+    env = env.env

@@ -9,6 +9,7 @@ import numpy as np
 
 from realab_suite import errors
 from realab_suite import trees
+from realab_suite.config import integers
 from realab_suite.config import messages
 from realab_suite.doors.gymnasium import codecs
 from realab_suite.doors.gymnasium import interfaces
@@ -105,7 +106,9 @@ class RealabVectorEnv(agent_view.Uncopied, gym.vector.VectorEnv):
     is_one = not isinstance(seed, Sequence | np.ndarray)
     super().reset(seed=seed if is_one else None, options=options)
     if seed is not None:
-      self._batch.rewind(seed)
+      seeds = _checked_seeds([seed] if is_one else seed)
+      new = seeds[0] if is_one else seeds
+      interfaces.shielded(lambda: self._batch.rewind(new))
     time_step = self._view.reset()
     self._present = time_step.observation
     self._has_begun = True
@@ -164,12 +167,20 @@ class RealabVectorEnv(agent_view.Uncopied, gym.vector.VectorEnv):
     return observations, rewards, terminated, truncated, infos
 
   def render(self) -> tuple[np.ndarray, ...] | None:
-    """Returns a frame of each world for people, or `None`."""
+    """Returns a frame of each world for people, or `None`.
+
+    Raises:
+      RenderingError: If no renderer is available, or if it fails.
+    """
     if self.render_mode is None:
       return None
     camera, height, width = self._interface.frame
     # A batch has no free camera, and refuses its number.
-    return tuple(self._batch.render(None, str(camera), height, width))
+    return tuple(
+        interfaces.shielded(
+            lambda: self._batch.render(None, str(camera), height, width)
+        )
+    )
 
   def close_extras(self, **kwargs: Any) -> None:
     """Frees the worlds."""
@@ -218,6 +229,16 @@ def _checked_mode(value: Any) -> AutoresetMode:
     raise errors.SpecError(
         f'autoreset_mode: {messages.quote(value)}; must be one of {allowed}'
     ) from None
+
+
+def _checked_seeds(seeds: Sequence[Any] | np.ndarray) -> list[int | None]:
+  """Returns seeds as integers of Python, which run no code of the agent."""
+  if isinstance(seeds, np.ndarray):
+    seeds = np.atleast_1d(seeds).tolist()
+  return [
+      None if seed is None else integers.check('seed', seed, 0, None)
+      for seed in seeds
+  ]
 
 
 def _checked_mask(reset_mask: Any, num_envs: int, seed: Any) -> np.ndarray:

@@ -1,9 +1,12 @@
 """Worlds with the interface of Gymnasium: ids, spaces, episodes and secrets."""
 
 import copy
+import functools
 import inspect
 import pickle
-from typing import Any
+import sys
+import traceback
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -25,11 +28,13 @@ from realab_suite.doors.gymnasium import registration
 from realab_suite.doors.gymnasium import single
 from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
+from realab_suite.engine import gl_contexts
 from realab_suite.engine import single_physics
 from realab_suite.entities import appearance
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import evaluate
 from realab_suite.feedback import mechanisms
+from tests.leaks import walk
 
 _NEAR = 'realab/UnlockDoor-near-InstantaneousReward-v3'
 _DISCRETE = {'overrides': ['action_set={name: dmlab_like, version: 1}']}
@@ -295,7 +300,7 @@ def test_a_world_without_a_new_seed_begins_its_next_episode():
   expected = envs.reset(seed=[1, 2, 3])
   _assert_same(envs.reset(seed=np.array([1, 2, 3])), expected)
   for seeds in ([1, None], [], [[1], 2, None], [-1, 2, 3], '123', np.array(1)):
-    with pytest.raises(errors.SpecError, match='random: '):
+    with pytest.raises(errors.SpecError, match=r'(random|seed): '):
       envs.reset(seed=seeds)
 
 
@@ -404,6 +409,95 @@ def test_a_wrapper_that_passes_a_seed_is_refused_at_the_first_reset(seed):
 
 def _still(unused_observation: Any) -> np.ndarray:
   return np.zeros(6, np.float32)
+
+
+def _fail(*unused: Any, **options: Any) -> Any:
+  raise RuntimeError('no GL')
+
+
+def _provoke(env: Any) -> list[Exception]:
+  """Returns the errors of an adapter that has a view of its world only."""
+  env.reset()
+  calls = [
+      *(functools.partial(env.reset, seed=seed) for seed in (True, [1], [0.5])),
+      env.render,
+      env.close,
+      functools.partial(env.reset, seed=3),
+      env.reset,
+      env.render,
+  ]
+  found = []
+  for call in calls:
+    try:
+      call()
+    except Exception as error:  # Whatever it is, the agent gets it.
+      found.append(error)
+  return found
+
+
+@pytest.mark.parametrize('num_envs', [0, 2])
+def test_no_frame_of_an_error_leads_to_the_world(monkeypatch, num_envs):
+  monkeypatch.setattr(gl_contexts, 'frame', _fail)
+  monkeypatch.setattr(batch_environment.BatchEnvironment, 'render', _fail)
+  options = {**_SHORT, 'render_mode': 'rgb_array'}
+  env = _make(**options)
+  if num_envs:
+    env = gym.make_vec(_NEAR, num_envs=num_envs, **options).unwrapped
+  found = _provoke(env)
+  worlds = environment.Environment, batch_environment.BatchEnvironment
+  assert len(found) == 7
+  for error in found:
+    assert (error.__cause__, error.__context__) == (None, None)
+    for frame, _ in traceback.walk_tb(error.__traceback__):
+      for part in walk.reach({**frame.f_locals, 'it': None}, 2):
+        assert not isinstance(part.value, worlds), (error, part.path)
+
+
+class _Index(int):
+  """A seed that looks at the frames below which it runs."""
+
+  seen: ClassVar[list[str]] = []
+
+  def __index__(self) -> int:
+    frame = sys._getframe(1)
+    while frame:
+      self.seen.append(frame.f_globals['__name__'])
+      frame = frame.f_back
+    return 5
+
+  __int__ = __index__
+
+
+def test_a_seed_runs_no_code_below_a_frame_of_the_world():
+  env = _make()
+  env.reset(seed=_Index(5))
+  assert 'realab_suite.doors.gymnasium.single' in _Index.seen
+  assert not any(name.startswith('realab_suite.engine') for name in _Index.seen)
+
+
+def test_an_evaluation_hands_out_no_seed():
+  env = gym.wrappers.RecordEpisodeStatistics(
+      gym.make(_NEAR, task_kwargs={'random': 5}, **_SHORT)
+  )
+  env.reset(seed=5)
+  assert env.spec.kwargs['task_kwargs'] == {'random': 5}
+  seen = []
+
+  def policy(observation):
+    for each in (env, env.unwrapped):
+      assert not each.spec.kwargs['task_kwargs']
+    assert env.unwrapped.np_random_seed != 5
+    if not seen:
+      clone = env.spec.make()
+      seen.append([observation, clone.reset()[0]])
+      clone.close()
+    return _still(observation)
+
+  evaluation.evaluate(env, policy, 1)
+  [(ours, theirs)] = seen
+  assert any((ours[key] != theirs[key]).any() for key in ours)
+  assert env.spec.kwargs['task_kwargs'] == {'random': 5}
+  assert env.unwrapped.np_random_seed == 5
 
 
 class _Quitting(gym.Wrapper):
