@@ -72,6 +72,7 @@ def main() -> None:
       experiment.calibration_seeds if _CALIBRATION.value else experiment.seeds
   )
   planned = jobs.plan(experiment, seeds, only)
+  storage.check_access(folder)
   unfinished = [
       job
       for job in planned

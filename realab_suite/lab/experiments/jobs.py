@@ -207,8 +207,10 @@ def check_codes(
     code: Code of what has started this process, or `None`.
 
   Raises:
-    ResultsError: If the folder has results of other code; see `storage`.
+    ResultsError: If the folder has results of other code, or of another user
+      who does not share them; see `storage`.
   """
+  storage.check_access(output)
   here = sources.digest()
   codes = [here, code or here, *kept_stakes.codes(output)]
   others = {}

@@ -90,6 +90,7 @@ def publish(folder: pathlib.Path, output: pathlib.Path) -> tuple[int, int]:
     ResultsError: If no job has finished, the results are published ones, a file
       of the sweep is damaged, or the output is not empty or cannot be written.
   """
+  storage.check_access(folder, is_written=False)
   sweep = sweep_results.load(folder)
   runs = sweep.runs.values()
   if not any(run.is_done for run in runs):

@@ -28,6 +28,7 @@ def load(
     ResultsError: If it is neither, a file in it is damaged, or its results are
       of different code. The message names the file and, if possible, the line.
   """
+  storage.check_access(folder, is_written=False)
   sweep = _load(folder)
   storage.check_codes(folder, sweep.codes, accept_other_code)
   return sweep

@@ -70,6 +70,50 @@ def new_folder(output: str) -> pathlib.Path:
   return folder
 
 
+def check_access(folder: pathlib.Path, *, is_written: bool = True) -> None:
+  """Checks that this user may use the folder of a sweep, which may be shared.
+
+  A member of a group whose umask is 077 makes files for no one else. A job
+  would meet some of them only after its work.
+
+  Args:
+    folder: The folder; it may be missing.
+    is_written: False if nothing is written to it.
+
+  Raises:
+    ResultsError: If it, a folder in it, or a file in one of them cannot be
+      read, or cannot be written to where a job has to. Folders of finished jobs
+      are only read.
+  """
+  with explained(folder):
+    if not folder.exists():
+      return
+    _check_permission(folder, folder, os.R_OK | os.X_OK)
+    for place in [folder, *filter(pathlib.Path.is_dir, folder.iterdir())]:
+      _check_permission(folder, place, os.R_OK | os.X_OK)
+      is_open = is_written and not (place / DONE).exists()
+      if is_open:
+        _check_permission(folder, place, os.W_OK)
+      for path in filter(pathlib.Path.is_file, place.iterdir()):
+        is_appended = path.name == _LOCK or path.suffix in ('.lock', '.log')
+        _check_permission(folder, path, os.R_OK)
+        if is_open and is_appended:
+          _check_permission(folder, path, os.W_OK)
+
+
+def _check_permission(
+    folder: pathlib.Path, path: pathlib.Path, mode: int
+) -> None:
+  """Raises a `ResultsError` if access to a path is not permitted."""
+  # A job that is running may have removed a file of its own.
+  if not os.access(path, mode) and path.exists():
+    what = 'written to' if mode == os.W_OK else 'read'
+    raise errors.ResultsError(
+        f'{path}: cannot be {what} by this user; its owner can permit it to the'
+        f' group: chmod -R g+rwX {folder}'
+    )
+
+
 @contextlib.contextmanager
 def locked(folder: pathlib.Path) -> Iterator[None]:
   """Locks a folder, and creates it if it does not exist.

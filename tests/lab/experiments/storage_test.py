@@ -8,6 +8,7 @@ import pathlib
 import pytest
 
 from realab_suite import errors
+from realab_suite.lab.experiments import jobs
 from realab_suite.lab.experiments import storage
 
 _HEADER = {'configuration': 'this'}
@@ -51,6 +52,66 @@ def test_what_is_no_json_is_named(tmp_path, text):
   path.write_text(text)
   with pytest.raises(errors.ResultsError, match='file: not JSON: '):
     storage.read_json(path)
+
+
+def _as_owner(path: pathlib.Path, mode: int) -> bool:
+  """Is `os.access` for a user who is not root."""
+  return path.stat().st_mode >> 6 & mode == mode
+
+
+def _shared(folder: pathlib.Path) -> pathlib.Path:
+  for name in ('lock', 'stakes/a.json', 'stakes/a.lock', 'logs/b-0.log',
+               'b-0/config.json', 'b-0/lock', 'c-0/done.json'):  # fmt: skip
+    (folder / name).parent.mkdir(exist_ok=True)
+    (folder / name).touch()
+  return folder
+
+
+@pytest.mark.parametrize(
+    ('name', 'mode', 'what'),
+    [
+        ('.', 0o000, 'read'),
+        ('.', 0o500, 'written to'),
+        ('lock', 0o400, 'written to'),
+        ('stakes', 0o000, 'read'),
+        ('stakes', 0o500, 'written to'),
+        ('stakes/a.json', 0o000, 'read'),
+        ('stakes/a.lock', 0o400, 'written to'),
+        ('logs/b-0.log', 0o400, 'written to'),
+        ('b-0/config.json', 0o000, 'read'),
+        ('b-0', 0o500, 'written to'),
+        ('c-0', 0o000, 'read'),
+        ('c-0/done.json', 0o000, 'read'),
+    ],
+)
+def test_a_folder_of_others_is_refused_before_any_work(
+    monkeypatch, tmp_path, name, mode, what
+):
+  folder = _shared(tmp_path)
+  monkeypatch.setattr(os, 'access', _as_owner)
+  storage.check_access(folder)
+  before = (folder / name).stat().st_mode
+  (folder / name).chmod(mode)
+  try:
+    with pytest.raises(errors.ResultsError, match=f'cannot be {what} by this'):
+      storage.check_access(folder)
+    with pytest.raises(errors.ResultsError, match=f'cannot be {what} by this'):
+      jobs.check_codes([], folder, True)
+    if what == 'written to':
+      storage.check_access(folder, is_written=False)
+  finally:
+    (folder / name).chmod(before)
+
+
+def test_finished_jobs_of_others_and_new_folders_are_accepted(
+    monkeypatch, tmp_path
+):
+  folder = _shared(tmp_path)
+  monkeypatch.setattr(os, 'access', _as_owner)
+  for name in ('c-0/done.json', 'c-0', 'stakes/a.json'):
+    (folder / name).chmod(0o500)
+  storage.check_access(folder)
+  storage.check_access(folder / 'missing')
 
 
 def test_the_first_difference_is_named_by_its_place():
