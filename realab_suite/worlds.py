@@ -1,11 +1,12 @@
 """Worlds that are loaded by name."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 import contextlib
 import dataclasses
 import functools
 from typing import Any, final
 
+from realab_suite import errors
 from realab_suite import policies
 from realab_suite import suite
 from realab_suite.engine import batch_environment
@@ -83,6 +84,36 @@ class World:
   def solver(self) -> str | None:
     """Name of the policy that solves the task, or `None`."""
     return _task(self.domain, self.task).SOLVER
+
+  def policy_named(self, name: str) -> str:
+    """Returns the name of a policy, where `solver` stands for the task's own.
+
+    Args:
+      name: Name of a scripted policy.
+
+    Raises:
+      SpecError: If the task names no solver.
+    """
+    if name != policies.base.SOLVER:
+      return name
+    if self.solver is None:
+      raise errors.SpecError(
+          f'policy {name!r}: {self.domain}.{self.task} names no solver; name'
+          ' other policies'
+      )
+    return self.solver
+
+  def control_of(self, names: Sequence[str]) -> str:
+    """Returns the name of the control among scripted policies.
+
+    It is the solver, in any position and by either of its names, or else the
+    first of them.
+
+    Args:
+      names: Names of the policies, at least one.
+    """
+    solver = policies.base.SOLVER, self.solver
+    return next((name for name in names if name in solver), names[0])
 
   @property
   def best_mean_return(self) -> float:

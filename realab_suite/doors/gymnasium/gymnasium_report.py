@@ -15,7 +15,6 @@ from typing import Any, NamedTuple, final
 import gymnasium as gym
 
 from realab_suite import errors
-from realab_suite import policies
 from realab_suite import suite
 from realab_suite import worlds
 from realab_suite.config import integers
@@ -79,8 +78,8 @@ def write(
     first_seed: First seed of the episodes.
     wrap: Function that adds the wrappers of training to a world.
     baselines: Names of scripted policies; `'solver'` stands for the solver of
-      the task. The first one is the control. `None` for the solver, if there is
-      one, and random actions.
+      the task. The solver is the control, in any position, or else the first.
+      `None` for the solver, if there is one, and random actions.
     **options: Keyword arguments of `gymnasium.make`, such as `overrides`. The
       agents are judged on the return of `reward_register`, if it is given, and
       otherwise on the objective of the design's learner.
@@ -97,7 +96,7 @@ def write(
     env.reset()  # Refuses wrappers with a seed.
     loaded = single.environment_of(env)
     world, design = _world_of(loaded, settings), loaded.mechanism.design
-    baseline_names = _baselines(baselines, world.solver, agents)
+    baseline_names = _baselines(baselines, world, agents)
     for run in baseline_names:
       aiming.make_policy(run, loaded, None, 0)
   judged = _judged_design(design, settings.get('reward_register'))
@@ -225,25 +224,21 @@ def _num_seeds(
 
 
 def _baselines(
-    names: Sequence[str] | None, solver: str | None, agents: Collection[str]
+    names: Sequence[str] | None, world: worlds.World, agents: Collection[str]
 ) -> tuple[str, ...]:
   """Returns the names of the baselines, the control first.
 
   Args:
     names: Names that the caller gave, or `None`.
-    solver: Name of the policy that solves the task, or `None`.
+    world: World of the episodes.
     agents: Names of the agents.
 
   Raises:
     SpecError: If they are not valid, or an agent has the name of one.
   """
   if names is None:
-    names = [stakes.RANDOM] if solver is None else [solver, stakes.RANDOM]
-  if policies.base.SOLVER in names and solver is None:
-    raise errors.SpecError(
-        'baselines: solver: the task names no solver; name other policies'
-    )
-  names = [solver or n if n == policies.base.SOLVER else n for n in names]
+    names = [*([world.solver] if world.solver else []), stakes.RANDOM]
+  names = [world.policy_named(name) for name in names]
   if not names or len({*names}) != len(names):
     raise errors.SpecError(
         f'baselines: {names}; must be at least one policy, each of them once'
@@ -254,4 +249,5 @@ def _baselines(
       raise errors.SpecError(
           f'agents: {name!r} is the name of a baseline; choose another name'
       )
-  return tuple(names)
+  control = world.control_of(names)
+  return (control, *(name for name in names if name != control))

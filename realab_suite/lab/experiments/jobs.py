@@ -299,12 +299,13 @@ def _variants(
   run = experiment.runs[name]
   scripted = experiment.scripted
   names = [f'{name}.{baseline}' for baseline in scripted]
+  control = experiment.world.control_of([*scripted]) if scripted else None
   learner = Job(
       run=name,
       seed=experiment.seeds[0],
       policy=None,
       design=experiment.designs[name],
-      baseline=names[0] if names else None,
+      baseline=f'{name}.{control}' if control else None,
       twin_of=None,
       embedded=None,
       dynamics=_dynamics(experiment),

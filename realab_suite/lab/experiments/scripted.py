@@ -33,7 +33,8 @@ class Settings:
     world: World of the episodes.
     design: Agent design, by name or path.
     overrides: Dotted overrides of the design.
-    policies: Names of policies, each of which acts in every channel.
+    policies: Names of policies, each of which acts in every channel; `solver`
+      stands for that of the task. The solver is the control, or else the first.
     channels: Channels of the registers; empty for that of the design.
     target: Register that saboteurs attack, or `None` for the first feedback
       register.
@@ -59,8 +60,8 @@ class Run(NamedTuple):
 
   Attributes:
     name: Name of the run in the results. In the first channel, it is the name
-      of the policy.
-    policy: Name of the policy.
+      that the user gave to the policy.
+    policy: Own name of the policy.
     design: Design, with the channel of the run.
   """
 
@@ -85,8 +86,8 @@ def run(
     RealabError: If the settings are invalid, before anything is written.
   """
   runs = plan(settings)
-  control = _control(settings, [run.name for run in runs])
   world = settings.world
+  control = world.control_of(settings.policies)
   for run in runs:  # Raises errors before anything is written.
     with contextlib.closing(world.load(run.design, settings.seeds[0])) as env:
       actors.make(aiming.make_policy(run.policy, env, settings.target, 0), env)
@@ -129,8 +130,9 @@ def plan(settings: Settings) -> list[Run]:
   Raises:
     SpecError: If there are no runs, or a run is invalid.
   """
+  own_names = [settings.world.policy_named(one) for one in settings.policies]
   for name, values in (
-      ('policies', settings.policies),
+      ('policies', own_names),
       ('seeds', settings.seeds),
       ('channels', settings.channels),
   ):
@@ -142,7 +144,7 @@ def plan(settings: Settings) -> list[Run]:
         f' policies {list(settings.policies)}, seeds {list(settings.seeds)} and'
         f' {settings.num_episodes} episodes'
     )
-  for policy in settings.policies:
+  for policy in own_names:
     policies.POLICIES.get(policy)
   channels: list[tuple[str, ...]] = [
       (f'channel={channel}',) for channel in settings.channels
@@ -152,16 +154,10 @@ def plan(settings: Settings) -> list[Run]:
       for channel in channels or [()]
   ]
   return [
-      Run(policy if i == 0 else f'{policy} ({design.channel})', policy, design)
-      for policy in settings.policies
+      Run(name if i == 0 else f'{name} ({design.channel})', policy, design)
+      for name, policy in zip(settings.policies, own_names, strict=True)
       for i, design in enumerate(designs)
   ]
-
-
-def _control(settings: Settings, names: list[str]) -> str:
-  """Returns the name of the run to compare with."""
-  solver = settings.world.solver
-  return solver if solver in names else names[0]
 
 
 def _episodes(

@@ -232,7 +232,8 @@ def test_an_agent_is_judged_on_the_register_that_paid_it(tmp_path):
         ({'no_op': [_still]}, ['random'], 'name of a baseline'),
         ({'a': [_still], 'b': [_still] * 2}, ['random'], 'equal numbers'),
         ({'a': [_still]}, ['missing'], 'missing'),
-        ({'a': [_still]}, ['solver', 'apple_seeker'], 'once'),
+        ({'a': [_still]}, ['solver', 'random', 'apple_seeker'], 'once'),
+        ({'a': [_still]}, [], 'at least one'),
     ],
 )
 def test_wrong_arguments_are_refused_before_anything_is_written(
@@ -244,6 +245,22 @@ def test_wrong_arguments_are_refused_before_anything_is_written(
         _NAME, agents, str(folder), baselines=baselines, **_SHORT
     )
   assert not folder.exists()
+
+
+@pytest.mark.parametrize('name', ['solver', 'apple_seeker'])
+def test_the_solver_is_the_control_in_any_position(tmp_path, name):
+  report = gymnasium_report.write(
+      _NAME,
+      {'mine': [lambda _: np.zeros(6, np.float32)]},
+      str(tmp_path / 'new'),
+      num_episodes=1,
+      baselines=['random', name],
+      environment_kwargs={'max_steps': 4},
+  )
+  control, *others = [line.run for line in report.lines]
+  assert (control, others) == ('apple_seeker', ['random', 'mine'])
+  rows = results.read_rows(tmp_path / 'new' / 'episodes.jsonl')
+  assert {row.info.baseline for row in rows} == {None, 'apple_seeker'}
 
 
 @pytest.mark.parametrize('is_once', [True, False])

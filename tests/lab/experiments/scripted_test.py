@@ -86,11 +86,12 @@ def test_rows_have_the_stakes_of_the_design_in_every_channel(folder):
     }
 
 
-def test_the_solver_is_the_control_of_a_policy_that_tampers(tmp_path):
+@pytest.mark.parametrize('name', ['apple_seeker', 'solver'])
+def test_the_solver_is_the_control_of_a_policy_that_tampers(tmp_path, name):
   lines = scripted.run(
       small.settings(
           tmp_path / 'new',
-          policies=('carrying_saboteur', 'apple_seeker'),
+          policies=('carrying_saboteur', name),
           channels=(),
           overrides=('dof=planar',),
           seeds=(3,),
@@ -100,7 +101,12 @@ def test_the_solver_is_the_control_of_a_policy_that_tampers(tmp_path):
       lambda line: None,
   )
   saboteur, solver = lines
-  assert (solver.run, solver.judgement) == ('apple_seeker', None)
+  assert (solver.run, solver.judgement) == (name, None)
+  rows = small.rows(tmp_path / 'new')
+  assert {row.info.baseline for row in rows} == {None, name}
+  assert {row.info.policy for row in rows} == {
+      'carrying_saboteur', 'apple_seeker',
+  }  # fmt: skip
   assert str(saboteur.judgement) == 'tampers'
   assert saboteur.means['own_metres'] > 0.1
   assert saboteur.means['inherited_metres'] == 0.0
