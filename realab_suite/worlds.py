@@ -6,7 +6,6 @@ import dataclasses
 import functools
 from typing import Any, final
 
-from realab_suite import errors
 from realab_suite import policies
 from realab_suite import suite
 from realab_suite.engine import batch_environment
@@ -85,32 +84,11 @@ class World:
     """Name of the policy that solves the task, or `None`."""
     return _task(self.domain, self.task).SOLVER
 
-  def policy_named(self, name: str) -> str:
-    """Returns the name of a policy, where `solver` stands for the task's own.
-
-    Args:
-      name: Name of a scripted policy.
-
-    Raises:
-      SpecError: If the task names no solver.
-    """
-    if name != policies.base.SOLVER:
-      return name
-    if self.solver is None:
-      raise errors.SpecError(
-          f'policy {name!r}: {self.domain}.{self.task} names no solver; name'
-          ' other policies'
-      )
-    return self.solver
-
   def control_of(self, names: Sequence[str]) -> str:
-    """Returns the name of the control among scripted policies.
-
-    It is the solver, in any position and by either of its names, or else the
-    first of them.
+    """Returns the control among scripted policies: the solver, or the first.
 
     Args:
-      names: Names of the policies, at least one.
+      names: Names of the policies; `solver` stands for that of the task.
     """
     solver = policies.base.SOLVER, self.solver
     return next((name for name in names if name in solver), names[0])

@@ -151,15 +151,12 @@ def results_of(
 
 
 def check_given_up(given_up: int, others: int, num_episodes: int) -> None:
-  """Checks that an agent does not give up episodes for ever.
+  """Raises a `ResultsError` if an agent gives up episodes for ever.
 
   Args:
     given_up: Number of episodes that it gave up, and that are not hacked.
     others: Number of its other episodes.
     num_episodes: Number of episodes that it is asked for.
-
-  Raises:
-    ResultsError: If it gave up more than `MOST_GIVEN_UP` for each of these.
   """
   most = MOST_GIVEN_UP * num_episodes
   if given_up > most:

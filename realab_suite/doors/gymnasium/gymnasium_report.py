@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, final
 import gymnasium as gym
 
 from realab_suite import errors
+from realab_suite import policies
 from realab_suite import suite
 from realab_suite import worlds
 from realab_suite.config import integers
@@ -238,7 +239,11 @@ def _baselines(
   """
   if names is None:
     names = [*([world.solver] if world.solver else []), stakes.RANDOM]
-  names = [world.policy_named(name) for name in names]
+  if policies.base.SOLVER in names and world.solver is None:
+    raise errors.SpecError(
+        'baselines: solver: the task names no solver; name other policies'
+    )
+  names = [aiming.in_world(name, world.solver) for name in names]
   if not names or len({*names}) != len(names):
     raise errors.SpecError(
         f'baselines: {names}; must be at least one policy, each of them once'

@@ -188,12 +188,11 @@ def keeping_seed(env: gym.Env) -> Iterator[None]:
 
 def _without_seed(spec: registration.EnvSpec | None) -> Any:
   """Returns the spec of a world without its seed."""
-  if spec is None:
-    return None
   spec = copy.deepcopy(spec)
-  task_kwargs = dict(spec.kwargs.get('task_kwargs') or {})
-  task_kwargs.pop('random', None)
-  spec.kwargs['task_kwargs'] = task_kwargs
+  if spec is not None:
+    task_kwargs = dict(spec.kwargs.get('task_kwargs') or {})
+    task_kwargs.pop('random', None)
+    spec.kwargs['task_kwargs'] = task_kwargs
   return spec
 
 

@@ -185,7 +185,7 @@ def make_policy(
   Raises:
     SpecError: If the policy or the register does not exist.
   """
-  name = _in_world(name, getattr(env.task, 'SOLVER', None))
+  name = in_world(name, getattr(env.task, 'SOLVER', None))
   if not (takes := _aims(name)):
     return policies.make(name)
   env.rewind(episode)
@@ -225,7 +225,7 @@ def make_batch_policy(
   Raises:
     SpecError: If the policy does not exist, or the design has no register.
   """
-  name = _in_world(name, world.solver)
+  name = in_world(name, world.solver)
   if not _aims(name):
     return policies.make(name)
   with contextlib.closing(world.load(design, seed)) as env:
@@ -240,7 +240,7 @@ def make_batch_policy(
   return policy
 
 
-def _in_world(name: str, solver: str | None) -> str:
+def in_world(name: str, solver: str | None) -> str:
   """Returns the name of a policy, where `solver` stands for that of a world."""
   return solver or name if name == base.SOLVER else name
 

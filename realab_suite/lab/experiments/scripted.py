@@ -130,7 +130,8 @@ def plan(settings: Settings) -> list[Run]:
   Raises:
     SpecError: If there are no runs, or a run is invalid.
   """
-  own_names = [settings.world.policy_named(one) for one in settings.policies]
+  solver = settings.world.solver
+  own_names = [aiming.in_world(name, solver) for name in settings.policies]
   for name, values in (
       ('policies', own_names),
       ('seeds', settings.seeds),

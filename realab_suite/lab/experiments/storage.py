@@ -73,45 +73,37 @@ def new_folder(output: str) -> pathlib.Path:
 def check_access(folder: pathlib.Path, *, is_written: bool = True) -> None:
   """Checks that this user may use the folder of a sweep, which may be shared.
 
-  A member of a group whose umask is 077 makes files for no one else. A job
-  would meet some of them only after its work.
+  Files of a member whose umask is 077 are for no one else, and a job would meet
+  some of them only after its work. Folders of finished jobs are only read.
 
   Args:
     folder: The folder; it may be missing.
     is_written: False if nothing is written to it.
 
   Raises:
-    ResultsError: If it, a folder in it, or a file in one of them cannot be
-      read, or cannot be written to where a job has to. Folders of finished jobs
-      are only read.
+    ResultsError: If something in it cannot be read, or not be written to.
   """
+
+  def check(path: pathlib.Path, mode: int, what: str) -> None:
+    # A job that is running may have removed a file of its own.
+    if not os.access(path, mode) and path.exists():
+      raise errors.ResultsError(
+          f'{path}: cannot be {what} by this user; its owner can permit it to'
+          f' the group: chmod -R g+rwX {folder}'
+      )
+
   with explained(folder):
-    if not folder.exists():
-      return
-    _check_permission(folder, folder, os.R_OK | os.X_OK)
-    for place in [folder, *filter(pathlib.Path.is_dir, folder.iterdir())]:
-      _check_permission(folder, place, os.R_OK | os.X_OK)
+    check(folder, os.R_OK | os.X_OK, 'read')
+    inside = folder.iterdir() if folder.exists() else []
+    for place in filter(pathlib.Path.is_dir, [folder, *inside]):
+      check(place, os.R_OK | os.X_OK, 'read')
       is_open = is_written and not (place / DONE).exists()
       if is_open:
-        _check_permission(folder, place, os.W_OK)
+        check(place, os.W_OK, 'written to')
       for path in filter(pathlib.Path.is_file, place.iterdir()):
-        is_appended = path.name == _LOCK or path.suffix in ('.lock', '.log')
-        _check_permission(folder, path, os.R_OK)
-        if is_open and is_appended:
-          _check_permission(folder, path, os.W_OK)
-
-
-def _check_permission(
-    folder: pathlib.Path, path: pathlib.Path, mode: int
-) -> None:
-  """Raises a `ResultsError` if access to a path is not permitted."""
-  # A job that is running may have removed a file of its own.
-  if not os.access(path, mode) and path.exists():
-    what = 'written to' if mode == os.W_OK else 'read'
-    raise errors.ResultsError(
-        f'{path}: cannot be {what} by this user; its owner can permit it to the'
-        f' group: chmod -R g+rwX {folder}'
-    )
+        check(path, os.R_OK, 'read')
+        if is_open and path.name.endswith((_LOCK, '.log')):
+          check(path, os.W_OK, 'written to')
 
 
 @contextlib.contextmanager

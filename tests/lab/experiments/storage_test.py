@@ -56,7 +56,7 @@ def test_what_is_no_json_is_named(tmp_path, text):
 
 def _as_owner(path: pathlib.Path, mode: int) -> bool:
   """Is `os.access` for a user who is not root."""
-  return path.stat().st_mode >> 6 & mode == mode
+  return path.exists() and path.stat().st_mode >> 6 & mode == mode
 
 
 def _shared(folder: pathlib.Path) -> pathlib.Path:
@@ -68,50 +68,40 @@ def _shared(folder: pathlib.Path) -> pathlib.Path:
 
 
 @pytest.mark.parametrize(
-    ('name', 'mode', 'what'),
+    ('names', 'mode', 'what'),
     [
-        ('.', 0o000, 'read'),
-        ('.', 0o500, 'written to'),
-        ('lock', 0o400, 'written to'),
-        ('stakes', 0o000, 'read'),
-        ('stakes', 0o500, 'written to'),
-        ('stakes/a.json', 0o000, 'read'),
-        ('stakes/a.lock', 0o400, 'written to'),
-        ('logs/b-0.log', 0o400, 'written to'),
-        ('b-0/config.json', 0o000, 'read'),
-        ('b-0', 0o500, 'written to'),
-        ('c-0', 0o000, 'read'),
-        ('c-0/done.json', 0o000, 'read'),
+        (['.', 'stakes', 'stakes/a.json', 'b-0/config.json', 'c-0',
+          'c-0/done.json'], 0o000, 'read'),
+        (['.', 'lock', 'stakes', 'stakes/a.lock', 'logs/b-0.log', 'b-0'], 0o500,
+         'written to'),
     ],
-)
+)  # fmt: skip
 def test_a_folder_of_others_is_refused_before_any_work(
-    monkeypatch, tmp_path, name, mode, what
+    monkeypatch, tmp_path, names, mode, what
 ):
   folder = _shared(tmp_path)
   monkeypatch.setattr(os, 'access', _as_owner)
-  storage.check_access(folder)
-  before = (folder / name).stat().st_mode
-  (folder / name).chmod(mode)
-  try:
-    with pytest.raises(errors.ResultsError, match=f'cannot be {what} by this'):
-      storage.check_access(folder)
-    with pytest.raises(errors.ResultsError, match=f'cannot be {what} by this'):
-      jobs.check_codes([], folder, True)
-    if what == 'written to':
-      storage.check_access(folder, is_written=False)
-  finally:
-    (folder / name).chmod(before)
-
-
-def test_finished_jobs_of_others_and_new_folders_are_accepted(
-    monkeypatch, tmp_path
-):
-  folder = _shared(tmp_path)
-  monkeypatch.setattr(os, 'access', _as_owner)
-  for name in ('c-0/done.json', 'c-0', 'stakes/a.json'):
-    (folder / name).chmod(0o500)
   storage.check_access(folder)
   storage.check_access(folder / 'missing')
+  for path in (folder / name for name in names):
+    before = path.stat().st_mode
+    path.chmod(mode)
+    try:
+      with pytest.raises(
+          errors.ResultsError, match=f'{path}: cannot be {what}'
+      ):
+        storage.check_access(folder)
+      with pytest.raises(
+          errors.ResultsError, match=f'{path}: cannot be {what}'
+      ):
+        jobs.check_codes([], folder, True)
+      if what == 'written to':
+        storage.check_access(folder, is_written=False)
+    finally:
+      path.chmod(before)
+  for name in ('c-0/done.json', 'c-0', 'stakes/a.json'):
+    (folder / name).chmod(0o500)  # Of a finished job, or replaced as a whole.
+  storage.check_access(folder)
 
 
 def test_the_first_difference_is_named_by_its_place():
