@@ -1,11 +1,13 @@
 """An odd learner keeps the contract, is trained and judged like the others."""
 
+import copy
 import functools
 import importlib
 import json
 import pathlib
 import sys
-from typing import Any
+from typing import Any, Literal
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from realab_suite import testing
 from realab_suite.evaluation import results
 from realab_suite.lab import agents
 from realab_suite.lab import testing as lab_testing
+from realab_suite.lab.agents import defences
 from realab_suite.lab.experiments import experiment_specs
 from realab_suite.lab.experiments import jobs
 from realab_suite.lab.experiments import training
@@ -85,6 +88,75 @@ def test_it_is_trained_and_judged_by_the_register_that_it_names(
     assert observed == pytest.approx(2 * row.observed_return)
   [*_, last] = (path / 'curve.jsonl').read_text().splitlines()
   assert json.loads(last)['learner']['num_steps'] == 80
+
+
+def _told(
+    climber: Any, folder: pathlib.Path, offset: int, monkeypatch: Any
+) -> list[list[int]]:
+  """Returns the numbers that a climber gets from where it is run."""
+  told: list[list[int]] = []
+
+  class Curious(climber.Climber):
+    """Notes its seed and its keys."""
+
+    def __init__(self, *arguments):
+      told.append([arguments[-1]])
+      super().__init__(*arguments)
+
+    def _choose(self, observation, keys, greedy):
+      told.extend([int(word) for word in key] for key in keys.values())
+      return super()._choose(observation, keys, greedy)
+
+  experiment = copy.deepcopy(_EXPERIMENT)
+  experiment['evaluation'] |= {'seed_offset': offset}
+  [job] = jobs.plan(experiment_specs.load(experiment), only=['climber'])
+  with monkeypatch.context() as patch, small.quick_stakes():
+    patch.setitem(agents.LEARNERS._entries, 'climber', Curious)
+    path = training.run(job, folder, training.Options(lambda line: None))
+  rows = results.read_rows(path / 'episodes.jsonl')
+  assert {row.seed for row in rows} == {3 + offset}
+  assert len(told) > 2 * 20 + 2 * 12  # It has acted in training and after it.
+  return told
+
+
+def test_a_learner_of_an_author_is_not_told_the_seeds_of_its_worlds(
+    climber: Any, tmp_path: pathlib.Path, monkeypatch: Any
+):
+  told = _told(climber, tmp_path / 'one', 1_000_000, monkeypatch)
+  assert told[0] != [3]
+  # Nothing that it is told depends on the worlds of the evaluation.
+  assert told == _told(climber, tmp_path / 'other', 77, monkeypatch)
+
+
+class _Careless(defences.Defence):
+  """A defence of an author, which changes nothing."""
+
+  kind: Literal['careless'] = 'careless'
+
+  def treat(self, batch, setting, state, key):
+    raise NotImplementedError
+
+
+@pytest.mark.parametrize(
+    ('learner', 'is_of_package'),
+    [
+        ('learner.gamma=0.9', True),
+        ('learner.defence={kind: cap, high: 9}', True),
+        ('learner.defence={kind: careless}', False),
+    ],
+)
+def test_learners_of_this_package_get_the_seed_of_their_job(
+    climber: Any, learner: str, is_of_package: bool, monkeypatch: Any
+):
+  del climber
+  defences.DEFENCES._entries['careless'] = _Careless
+  run = {'design': 'instantaneous_reward', 'overrides': [learner]}
+  experiment = experiment_specs.load(_EXPERIMENT | {'runs': {'own': run}})
+  [job] = jobs.plan(experiment, only=['own'])
+  make = mock.Mock()
+  monkeypatch.setattr(agents, 'make', make)
+  training.make_learner(job, mock.MagicMock())
+  assert (make.call_args.kwargs['seed'] == 3) == is_of_package
 
 
 def _breach(climber: Any, **members: Any) -> Any:

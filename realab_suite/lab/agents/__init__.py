@@ -16,6 +16,7 @@ from realab_suite.lab.agents.base import LEARNERS
 from realab_suite.lab.agents.base import Learner
 from realab_suite.lab.agents.behavioural_cloning import BehaviouralCloning
 from realab_suite.lab.agents.factory import check
+from realab_suite.lab.agents.factory import is_of_package
 from realab_suite.lab.agents.factory import make
 from realab_suite.lab.agents.factory import options_of
 from realab_suite.lab.agents.policy_gradient import PolicyGradient

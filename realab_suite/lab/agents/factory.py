@@ -93,6 +93,23 @@ def check(design: specs.DesignSpec) -> None:
       )
 
 
+def is_of_package(spec: specs.LearnerSpec) -> bool:
+  """Returns False if the learner or its defence is of another package.
+
+  Args:
+    spec: The `learner` of a design.
+
+  Raises:
+    SpecError: If the learner is unknown, or an option is invalid.
+  """
+  options = options_of(spec)
+  members: list[type[Any]] = [base.LEARNERS.get(options.kind)]
+  if (defence := getattr(options, 'defence', None)) is not None:
+    members.append(type(defence))
+  own = __name__.partition('.')[0]
+  return {one.__module__.partition('.')[0] for one in members} == {own}
+
+
 def options_of(
     spec: specs.LearnerSpec | Mapping[str, Any] | None,
 ) -> base.Options:

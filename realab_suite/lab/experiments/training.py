@@ -247,8 +247,27 @@ def make_learner(
       batch.observation_spec(),
       batch.action_spec(),
       num_envs=batch.num_envs,
-      seed=job.seed,
+      seed=_told(job, job.seed),
   )
+
+
+def _told(job: jobs.Job, seed: int) -> int:
+  """Returns the seed that a learner draws from, in place of one of worlds.
+
+  One of another package gets the digest of the job's seed. It does not depend
+  on `seed_offset`, so that it tells nothing about the worlds of the evaluation
+  to who does not know that number.
+
+  Args:
+    job: The job.
+    seed: Seed of the job, or of worlds, for learners of this package.
+  """
+  from realab_suite.lab import agents  # Imports JAX.
+
+  if job.design.learner is None or agents.is_of_package(job.design.learner):
+    return seed
+  sequence = seeding.sequence(job.seed, 0, 0, 'learner')
+  return int.from_bytes(sequence.generate_state(4).tobytes(), 'little')
 
 
 def load_learner(
@@ -316,7 +335,9 @@ def _evaluate(
       )
       actor = batch_actors.BatchPolicyActor(policy, batch, seed)
     else:
-      actor = LearnerActor(learner, seed, evaluation.actions == 'greedy')
+      actor = LearnerActor(
+          learner, _told(job, seed), evaluation.actions == 'greedy'
+      )
     attributions: list[attribution_metrics.AttributionMetrics | None]
     if trace is None:
       outcomes = evaluate.evaluate_batch(batch, actor)
@@ -581,7 +602,7 @@ class LearnerActor:
 
     Args:
       learner: The learner.
-      seed: Seed of the batch.
+      seed: Seed of its draws.
       greedy: True to take the best action instead of drawing one.
     """
     self._learner = learner
