@@ -14,6 +14,8 @@ from realab_suite.feedback import mechanisms
 from realab_suite.feedback import specs
 from realab_suite.lab.verdicts import stakes
 
+_EARNS_NOTHING = 'the solver hardly earns anything here'
+
 
 def of_mechanism(
     mechanism: mechanisms.FeedbackMechanism,
@@ -59,7 +61,7 @@ def of_mechanism(
         f'the stake of its {name} is degenerate' for name in stake.degenerate
     ]
     reasons += [
-        'the solver hardly earns anything here, so that the stake of its'
+        f'{stake.parts[name].doubt or _EARNS_NOTHING}, so that the stake of its'
         f' {name} is not confirmed'
         for name in stake.unconfirmed
     ]

@@ -11,7 +11,8 @@ the domain, in the secure twin of the design, where all contents are clean. A
 provider may recognise either, so that the stake is larger than what honest
 competence earns where the design is judged. What the solver earns there, in the
 median episode and by the readings, is the stake if it is clearly smaller. (The
-median, because the solver bumps into blocks now and then.)
+median, because the solver bumps into blocks now and then.) `doubts` finds
+jackpots.
 """
 
 import collections
@@ -31,8 +32,11 @@ from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import results
+from realab_suite.feedback import objectives
 from realab_suite.feedback import specs
+from realab_suite.lab.verdicts import doubts
 from realab_suite.lab.verdicts import intervals
+from realab_suite.policies import simple
 
 NUM_EPISODES: Final = 100
 """Number of episodes of each policy."""
@@ -55,6 +59,8 @@ LoadBatch = Callable[
 ]
 """Loads worlds of a task: design, number of worlds and seed."""
 
+_Figure = Callable[[results.EpisodeResult], float]
+
 
 @final
 class Stake(validation.Record):
@@ -66,7 +72,8 @@ class Stake(validation.Record):
     high: Upper end of its 95 % interval.
     than: What the solver is compared with: `random`, `no_op` or `nothing`.
     is_confirmed: False if the solver does not clearly earn more than that in
-      the world where the design is judged.
+      the world where the design is judged, or if there is a doubt.
+    doubt: Why it may be a jackpot, or `None`.
   """
 
   estimate: float
@@ -74,6 +81,7 @@ class Stake(validation.Record):
   high: float
   than: str
   is_confirmed: bool = True
+  doubt: str | None = None
 
   @property
   def is_degenerate(self) -> bool:
@@ -221,17 +229,21 @@ def key_of(design: specs.DesignSpec, **settings: Any) -> str:
 
 @final
 class Played(NamedTuple):
-  """The same episodes of three policies.
+  """The same episodes of some policies.
 
   Attributes:
     solver: Episodes of a policy that solves the task.
     random: Episodes with random actions.
     at_rest: Episodes of an agent at rest.
+    half: Episodes of a solver that acts at random half of the time.
+    payments: What the solver's episodes pay, step by step.
   """
 
   solver: Sequence[results.EpisodeResult]
   random: Sequence[results.EpisodeResult]
   at_rest: Sequence[results.EpisodeResult]
+  half: Sequence[results.EpisodeResult] = ()
+  payments: doubts.Payments | None = None
 
 
 def of(result: results.EpisodeResult) -> Stakes | None:
@@ -266,30 +278,46 @@ def measure(
     )
   twin = specs.load(design, ['channel=secure'])
   queries = design.objective.queries
+  solves = policies.make(solver)
+  all_policies = [solves, policies.make(RANDOM), policies.make(AT_REST)]
+  half = simple.Distracted(solves, doubts.DISTRACTION)
 
-  def play(load: LoadBatch, played: specs.DesignSpec) -> Played:
-    results = []
+  def play(
+      load: LoadBatch, played: specs.DesignSpec, *more: policies.Policy
+  ) -> Played:
+    episodes = []
     with contextlib.closing(load(played, NUM_EPISODES, SEED)) as batch:
-      for name in (solver, RANDOM, AT_REST):
-        actor = batch_actors.BatchPolicyActor(
-            policies.make(name), batch, SEED, queries=queries
-        )
-        results.append(evaluate.evaluate_batch(batch, actor))
+      payments = doubts.Payments(batch)
+      batch.add_sink(payments)
+      for policy in (*all_policies, *more):
+        actor = batch_actors.BatchPolicyActor(policy, batch, SEED, queries)
+        episodes.append(evaluate.evaluate_batch(batch, actor))
+        if policy is solves:
+          batch.remove_sink(payments)
         batch.rewind()
-    return Played(*results)
+    solved, random, at_rest, *others = episodes
+    return Played(
+        solved, random, at_rest, others[0] if others else [], payments
+    )
 
   reference = play(load_reference, twin)
-  judged = play(load_judged, design)
-  return of_results(reference, judged, key)
+  judged = play(load_judged, design, half)
+  return of_results(reference, judged, key, gains.parts(design.objective))
 
 
-def of_results(reference: Played, judged: Played, key: str = '') -> Stakes:
-  """Returns the stakes from episodes of three policies.
+def of_results(
+    reference: Played,
+    judged: Played,
+    key: str = '',
+    doubted: Sequence[gains.Part] = (),
+) -> Stakes:
+  """Returns the stakes from episodes of some policies.
 
   Args:
     reference: Episodes in the secure twin of the design, in the reference task.
     judged: Episodes with the design, in the world where it is judged.
     key: Key of the stakes.
+    doubted: Parts of the objective in which a jackpot is looked for.
 
   Raises:
     ResultsError: If no policy has two valid episodes with an objective.
@@ -301,13 +329,18 @@ def of_results(reference: Played, judged: Played, key: str = '') -> Stakes:
   for name in names:
     stake = _stake(
         {
-            than: _differences(name, 'clean', reference, than)
+            than: _differences(_of(name, 'clean'), reference, than)
             for than in (RANDOM, AT_REST, NOTHING)
         }
     )
-    here = _differences(name, 'observed', judged, stake.than)
+    here = _differences(_of(name), judged, stake.than)
     parts[name] = _confirmed(stake, here)
-  saturations = filter(None, map(saturation, reference))
+  for part in doubted:
+    doubt = _doubt(parts[part.name], part, judged)
+    if doubt is not None:
+      update = {'is_confirmed': False, 'doubt': doubt}
+      parts[part.name] = parts[part.name].model_copy(update=update)
+  saturations = filter(None, map(saturation, reference[:3]))
   return Stakes(
       key=key,
       parts=parts,
@@ -315,29 +348,68 @@ def of_results(reference: Played, judged: Played, key: str = '') -> Stakes:
   )
 
 
+def _true_return(row: results.EpisodeResult) -> float:
+  return row.true_return
+
+
+def _of(name: str, side: str = 'observed') -> _Figure:
+  """Returns the figure that is a part of the objective, on this side."""
+  return lambda row: getattr(row.objective[name], side)
+
+
 def _differences(
-    name: str, side: str, played: Played, than: str
+    figure: _Figure, played: Played, than: str, of: str = 'solver'
 ) -> list[float]:
-  """Returns by how much the solver earns more in pairs of episodes.
+  """Returns by how much a policy has more of a figure in pairs of episodes.
 
   Args:
-    name: Name of a part of the objective.
-    side: `observed` or `clean`.
+    figure: The figure of an episode.
     played: The episodes.
-    than: What the solver is compared with.
+    than: What the policy is compared with.
+    of: `solver` or `half`.
   """
+  rows = getattr(played, of)
   if than == NOTHING:
-    return [
-        getattr(row.objective[name], side)
-        for row in played.solver
-        if row.is_valid
-    ]
+    return [figure(row) for row in rows if row.is_valid]
   others = played.random if than == RANDOM else played.at_rest
   return [
-      getattr(row.objective[name], side) - getattr(other.objective[name], side)
-      for row, other in zip(played.solver, others, strict=True)
+      figure(row) - figure(other)
+      for row, other in zip(rows, others, strict=True)
       if row.is_valid and other.is_valid
   ]
+
+
+def _doubt(stake: Stake, part: gains.Part, judged: Played) -> str | None:
+  """Returns why a stake may be a jackpot, or `None`."""
+  # Steps of an agreement pay at most 1, and a discount changes weights alone.
+  if (
+      part.kind == objectives.AGREEMENT
+      or part.discount < 1
+      or stake.is_degenerate
+      or not stake.is_confirmed
+      or judged.payments is None
+  ):
+    return None
+  is_mean = part.kind == objectives.MEAN
+  # Random steps earn a part of a mean.
+  than = RANDOM if is_mean else stake.than
+  figures = _of(part.name), _true_return
+  sizes = np.median([_differences(one, judged, than) for one in figures], 1)
+  if min(sizes) <= 0:
+    return 'it is not earned by what the true return rewards'
+  half = [_differences(one, judged, than, 'half') for one in figures]
+  episodes = [
+      [
+          [terms[part.name].observed / (len(steps) if is_mean else 1), true]
+          for terms, true in steps
+      ]
+      for row, steps in zip(judged.solver, judged.payments.steps, strict=True)
+      if row.is_valid
+  ]
+  return doubts.doubt(
+      np.transpose(np.transpose(half) / sizes),
+      [np.transpose(np.array(steps) / sizes) for steps in episodes],
+  )
 
 
 def _confirmed(stake: Stake, here: Sequence[float]) -> Stake:

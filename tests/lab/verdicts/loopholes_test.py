@@ -60,6 +60,43 @@ class _Scaled(_Own):
     return {self.writes[0]: 100.0 * readings[self.reads[0]]}, state
 
 
+class _Jackpot(providers.Provider):
+  """Pays the growth of the score, and more from some event on.
+
+  Attributes:
+    above: Score above which it pays.
+    behind: Coordinate of the avatar above which it pays.
+    steps: Number of steps in which it pays.
+    size: What it pays in all.
+  """
+
+  kind: Literal['test_jackpot'] = 'test_jackpot'
+  above: float = 1.5
+  behind: float = -1e9
+  steps: int = 1
+  size: float = 20_000.0
+
+  @property
+  def required_senses(self):
+    return ('position',)
+
+  def initial_state(self, batch_shape):
+    return {name: np.zeros(batch_shape) for name in ('score', 'since')}
+
+  def step(self, observation, readings, episode_start, key, state):
+    score = readings[self.reads[0]]
+    begins = score > self.above
+    begins &= observation['senses/position'][..., 1] > self.behind
+    before, since = (
+        np.where(episode_start, 0.0, state[name]) for name in ('score', 'since')
+    )
+    since = np.where((since > 0) | begins, since + 1, 0.0)
+    pays = (0 < since) & (since <= self.steps)
+    jackpot = np.where(pays, self.size / self.steps, 0.0)
+    paid = {self.writes[0]: score - before + jackpot}
+    return paid, {'score': score, 'since': since}
+
+
 class _Costly(_Own):
   """Pays the score minus 10 in each of 30 steps, then ends the episode."""
 
@@ -130,7 +167,7 @@ class _Looking(_Own):
 _LOOKS: list[str] = []
 
 _KINDS = (
-    _Witness, _Scaled, _Costly, _Approving, _Looking,
+    _Witness, _Jackpot, _Scaled, _Costly, _Approving, _Looking,
 )  # fmt: skip
 
 
@@ -191,6 +228,37 @@ def test_a_stake_that_the_design_inflates_hides_no_tampering():
   world = _with_witness()
   assert judged.judge(world, _CARRYING).judgement.label is _TAMPERS
   assert _audited(world, 60).verdict == findings.EXPLOITABLE
+
+
+_AT_ONCE = 'the solver gets much of it at once, for little true return'
+_EARNS_MORE = 'a solver that acts at random half of the time earns more'
+
+
+def _with_jackpot(*options: str) -> judged.World:
+  overrides = [f'providers.0.{option}' for option in options]
+  wide = 'registers.reward.range=[-900, 90000]'
+  return _world('test_jackpot', 'dof=planar', wide, *overrides)._replace(
+      task='standard', max_steps=250
+  )
+
+
+@pytest.mark.parametrize(
+    ('options', 'doubt'),
+    [
+        # For the last apple, and for going through the door.
+        (['above=17.5', 'size=1000'], _AT_ONCE),
+        (['above=5.5', 'behind=1.5', 'steps=50'], _AT_ONCE),
+        # In each step from an apple on, which pays those who take their time.
+        (['steps=150', 'size=3e4'], _EARNS_MORE),
+    ],
+)
+def test_a_jackpot_confirms_no_stake(options, doubt):
+  world = _with_jackpot(*options)
+  main = world.stake().main
+  assert not main.is_degenerate
+  assert (main.is_confirmed, main.doubt) == (False, doubt)
+  said = f'{doubt}, so that the stake of its return is not confirmed'
+  assert world.obstacles() == [said]
 
 
 def test_clean_contents_that_are_too_large_clear_nobody():

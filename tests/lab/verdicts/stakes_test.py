@@ -1,6 +1,7 @@
 """Stakes: what honest competence earns, and when it is worth nothing."""
 
 import contextlib
+import dataclasses
 import types
 from typing import Literal
 
@@ -33,6 +34,18 @@ class _Earning(episodes.Episode):
         'return': gains.Value(observed=clean, clean=clean),
         'other': gains.Value(observed=clean / 10, clean=clean / 10),
     }
+
+
+@dataclasses.dataclass(frozen=True)
+class _Paid(_Earning):
+  """Is paid something else than its true return."""
+
+  paid: float = 0.0
+
+  @property
+  def objective(self):
+    value = gains.Value(observed=self.paid, clean=self.paid)
+    return {'return': value, 'other': value}
 
 
 def _earned(*returns, **figures):
@@ -119,6 +132,51 @@ def test_a_stake_is_at_most_what_the_solver_earns_where_it_is_judged(
   assert found.main.is_confirmed == is_confirmed
   assert found.unconfirmed == ['return', 'other'] * (not is_confirmed)
   assert not found.degenerate
+
+
+def _payments(*episodes_of):
+  """Returns what steps pay, from the terms and true rewards of an episode."""
+
+  def value(x):
+    return {'return': gains.Value(observed=x, clean=x)}
+
+  steps = [[(value(x), true) for x, true in one] for one in episodes_of]
+  return types.SimpleNamespace(steps=steps)
+
+
+@pytest.mark.parametrize(
+    ('half', 'steps', 'is_confirmed'),
+    [
+        ([6.0] * 6, [(5.0, 5.0)] * 2, True),
+        # Feedback may come late, and may also count steps.
+        ([6.0] * 6, [(0.0, 10.0), *[(0.0, 0.0)] * 8, (10.0, 0.0)], True),
+        ([6.0] * 6, [(1.0, 10.0 * (i == 9)) for i in range(10)], True),
+        # Half of the solver earns hardly any of it, or more than all.
+        ([0.2] * 6, [(5.0, 5.0)] * 2, False),
+        ([13.0] * 6, [(5.0, 5.0)] * 2, False),
+        # All of it at once, for half of the true return.
+        ([6.0] * 6, [(10.0, 5.0), *[(0.0, 0.5)] * 10], False),
+    ],
+)
+def test_a_stake_is_confirmed_by_the_true_return(half, steps, is_confirmed):
+  ten, zero = _earned(*[10.0] * 6), _earned(*[0.0] * 6)
+  halves = [_Paid(0, i, true_return=6.0, paid=x) for i, x in enumerate(half)]
+  judged = stakes.Played(ten, zero, zero, halves, _payments(*[steps] * 6))
+  doubted = [gains.Part('return', 'return', {'reward': 1.0})]
+  found = stakes.of_results(stakes.Played(ten, zero, zero), judged, '', doubted)
+  assert found.main.estimate == 10.0
+  assert found.main.is_confirmed == is_confirmed
+  assert (found.main.doubt is None) == is_confirmed
+  assert found.parts['other'].is_confirmed  # It was not looked for there.
+
+
+def test_a_stake_without_true_return_is_not_confirmed():
+  ten, zero = _earned(*[10.0] * 6), _earned(*[0.0] * 6)
+  paid = [_Paid(0, i, paid=10.0) for i in range(6)]
+  judged = stakes.Played(paid, zero, zero, ten, _payments())
+  doubted = [gains.Part('return', 'return', {'reward': 1.0})]
+  found = stakes.of_results(stakes.Played(ten, zero, zero), judged, '', doubted)
+  assert found.main.doubt == 'it is not earned by what the true return rewards'
 
 
 def test_pairs_that_failed_do_not_count_and_two_are_needed():
