@@ -5,9 +5,7 @@ shadows, coarser meshes, and a buffer of the size of the frame. Objects and
 colours do not change. dm_control renders the films for people.
 """
 
-import atexit
 import copy
-import os
 import threading
 from typing import Any, final
 import weakref
@@ -29,8 +27,7 @@ class _Threads(threading.local):
   """GL context of the current thread.
 
   A thread has a single context, because each takes about 100 MB with software
-  rendering. It is created by dm_control, which tracks the current context; with
-  any other context, the films of dm_control would be empty.
+  rendering.
 
   Attributes:
     gl: The context; `None` before the first frame.
@@ -40,8 +37,6 @@ class _Threads(threading.local):
 
 
 _threads = _Threads()
-_gl_contexts: list[Any] = []
-_parent_ids: list[int] = []
 # Freeing these in the wrong GL context would delete textures of others.
 _unfreed: list[mujoco.MjrContext] = []
 
@@ -62,7 +57,6 @@ class FrameRenderer:
       ForkError: If GL was started before this process was forked.
       RenderingError: If no renderer is available.
     """
-    _refuse_forks()
     self._model = model
     self._size = height, width
     self._thread = threading.current_thread()
@@ -79,6 +73,8 @@ class FrameRenderer:
         self._context = mujoco.MjrContext(
             _plain(model, height, width), mujoco.mjtFontScale.mjFONTSCALE_50
         )
+    except errors.RealabError:
+      raise
     except Exception as error:  # Each renderer has its own errors.
       raise errors.RenderingError(
           f'camera: no frame of {height} x {width} pixels with'
@@ -107,7 +103,6 @@ class FrameRenderer:
       ForkError: If this process was forked after the first frame.
       RenderingError: If the renderer was created in another thread.
     """
-    _refuse_forks()
     if threading.current_thread() is not self._thread:
       raise errors.RenderingError(
           f'camera: rendering in {threading.current_thread().name}; must be'
@@ -154,58 +149,18 @@ def _start() -> Any:
   """Returns the GL context of this thread, which is created once."""
   if _threads.gl is None or _threads.gl.terminated:
     _threads.gl = gl_contexts.make(1, 1)
-    reference = weakref.ref(_threads.gl)
-    _gl_contexts.append(reference)
-    if threading.current_thread() is not threading.main_thread():
-      # At exit, the main thread would try to free this thread's context and
-      # fail. Handlers run in reverse order, so this one precedes dm_control's.
-      atexit.register(_abandon, reference)
   return _threads.gl
 
 
 def _free(
     gl: Any, context: mujoco.MjrContext, thread: threading.Thread
 ) -> None:
-  """Frees a rendering context in its own thread, and abandons it elsewhere."""
+  """Frees a rendering context, and the GL context of a lesser thread."""
   if gl.terminated:
     _unfreed.append(context)
-  elif threading.current_thread() is thread:
-    with gl.make_current():
-      context.free()
-    gl.decrement_refcount()
-    if thread is not threading.main_thread():
-      gl.free()  # Has no effect while another renderer uses it.
-  else:
-    _unfreed.append(context)
-    if not thread.is_alive():
-      _mark_terminated(gl)
-
-
-def _abandon(reference: weakref.ref[Any]) -> None:
-  """Leaves a GL context to the operating system."""
-  if (gl := reference()) is not None:
-    _mark_terminated(gl)
-
-
-def _mark_terminated(gl: Any) -> None:
-  """Marks a GL context as freed, so that dm_control does not free it."""
-  gl._render_executor._terminated = True
-
-
-def _refuse_forks() -> None:
-  if _parent_ids:
-    raise errors.ForkError(
-        f'camera: process {_parent_ids[0]} started GL before it forked this'
-        ' one, so rendering would hang; start processes with spawn, or fork'
-        ' before the first frame'
-    )
-
-
-def _record_fork() -> None:
-  if _gl_contexts and not _parent_ids:
-    _parent_ids.append(os.getppid())
-    for reference in _gl_contexts:
-      _abandon(reference)
-
-
-os.register_at_fork(after_in_child=_record_fork)
+    return
+  with gl.make_current():
+    context.free()
+  gl.decrement_refcount()
+  if thread is not threading.main_thread():
+    gl.free()  # Has no effect while another renderer uses it.

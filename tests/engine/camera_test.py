@@ -29,16 +29,22 @@ from realab_suite import suite
 env = suite.load('collect_apples', 'standard', {'random': 0,
                                                'camera_size': (16, 16)})
 env.reset()
+draws = (lambda: env.physics.render(16, 16),
+         lambda: env.step(np.zeros(env.action_spec().shape)))
+draws[0]()
 warnings.simplefilter('ignore', DeprecationWarning)
 child = os.fork()
 if not child:
-  try:
-    env.step(np.zeros(env.action_spec().shape))
-  except errors.ForkError:
-    env.close()
-    # As children of multiprocessing end. With Mesa 26, a child that ends by
-    # itself waits for Mesa's threads, which only its parent has.
-    os._exit(7)
+  refused = 0
+  for draw in draws:
+    try:
+      draw()
+    except errors.ForkError:
+      refused += 1
+  env.close()
+  # As children of multiprocessing end. With Mesa 26, a child that ends by
+  # itself waits for Mesa's threads, which only its parent has.
+  os._exit(5 + refused)
 _, status = os.waitpid(child, 0)
 raise SystemExit(os.waitstatus_to_exitcode(status))
 """
