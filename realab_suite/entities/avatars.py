@@ -304,7 +304,9 @@ class Avatar(measurables.MeasurableEntity):
             friction=(slip, slip, spin, roll, roll),
         )
         self._pairs.append(pair)
-      grasp = grasps.Grasp(self._hand, block.site, self._hand_position)
+      grasp = grasps.Grasp(
+          self._hand, block.site, self._hand_position, block.turns_along
+      )
       block.grasps.append(grasp)
       self._grasps.append(grasp)
       self._blocks.append(block)
@@ -489,7 +491,10 @@ class Avatar(measurables.MeasurableEntity):
       velocity = self._hand_velocity(physics)
       for i, block in enumerate(self._blocks):
         block.slow_down(physics, velocity, released[..., i])
-    constraints.active = grasps.active((held | takes) & ~drops, distances)
+    is_held = (held | takes) & ~drops
+    constraints.active = grasps.active(is_held, distances)
+    for i, grasp_of_block in enumerate(self._grasps):
+      grasp_of_block.turn_along(physics, is_held[..., i])
 
   def _hand_position(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the position of the hand, `(..., 2)`, from the state alone."""

@@ -104,6 +104,7 @@ class Block(abc.ABC):
       style: dict[str, Any],
       direction: tuple[float, float] | None = None,
       ports: Sequence[str] = (),
+      turns_along: bool = False,
   ) -> None:
     """Adds the block to the model of a register.
 
@@ -116,10 +117,12 @@ class Block(abc.ABC):
       style: Geom attributes; see `appearance.geom_style`.
       direction: As the property of that name.
       ports: As the property of that name.
+      turns_along: As the property of that name.
     """
     self._half_size = half_size
     self._direction = direction
     self._ports = tuple(ports)
+    self._turns_along = turns_along
     self._physics: protocols.Physics | None = None
     self._moved: Any = None
     self._grasps: list[grasps.Grasp] = []
@@ -171,6 +174,11 @@ class Block(abc.ABC):
   def ports(self) -> tuple[str, ...]:
     """Ports of the register that depend on the block; none stands for all."""
     return self._ports
+
+  @property
+  def turns_along(self) -> bool:
+    """True if the block turns with a hand that holds it."""
+    return self._turns_along
 
   @property
   def body(self) -> mjcf.Element:

@@ -27,13 +27,21 @@ _IMPEDANCE = 0.7
 _DAMPING = 40.0
 # The first strength is critically damped.
 _FIRM = (0.05, 1.0)
+# A hand turns a block of some registers along. A weld would hold its angle, and
+# the yaw of the avatar where the block cannot turn. These welds have damping
+# and no stiffness: they match velocities, whatever the angle is, and a block
+# that is stuck brakes the avatar a little. Each is for the angles of up to an
+# eighth of a turn from its own, as a weld half a turn away has no effect.
+_NUM_WELDS = 4
+_TURNING_IMPEDANCE = 0.98
 
 
 @final
 class Grasp:
   """The hold of one hand on one block: an equality constraint per strength.
 
-  At most one of the constraints is active.
+  At most one of the constraints is active. If the hand turns the block along,
+  one of several welds is active as well.
   """
 
   def __init__(
@@ -41,6 +49,7 @@ class Grasp:
       hand: mjcf.Element,
       site: mjcf.Element,
       hand_position: Callable[[Any], np.ndarray],
+      turns_along: bool = False,
   ) -> None:
     """Adds the constraints to the model.
 
@@ -50,7 +59,9 @@ class Grasp:
       hand_position: Function of the physics that returns the position of the
         hand in the plane of the floor, `(..., 2)`, in m, without derived
         quantities, which are out of date after a write.
+      turns_along: True if the block turns with the hand.
     """
+    self._ends = hand, site
     self._hand_position = hand_position
     self._physics: protocols.Physics | None = None
     self._bound: Any = None
@@ -71,6 +82,21 @@ class Grasp:
         )
         for i, solref in enumerate(_SOLREFS)
     )
+    angles = np.arange(_NUM_WELDS if turns_along else 0) * np.pi / 2
+    self._welds = tuple(
+        hand.root.root_model.equality.add(
+            'weld',
+            name=f'{ends}-turn-{i}',
+            body1=hand.parent,
+            body2=site.parent,
+            relpose=[*hand.pos, np.cos(angle / 2), 0, 0, np.sin(angle / 2)],
+            anchor=(0, 0, 0),
+            active='false',
+            solref=(0, -_DAMPING),
+            solimp=(_TURNING_IMPEDANCE, _TURNING_IMPEDANCE, 0.001),
+        )
+        for i, angle in enumerate(angles)
+    )
 
   @property
   def constraints(self) -> tuple[mjcf.Element, ...]:
@@ -79,12 +105,36 @@ class Grasp:
 
   def remove(self) -> None:
     """Removes the constraints from the model."""
-    for constraint in self._constraints:
+    for constraint in (*self._constraints, *self._welds):
       constraint.remove()
 
   def release(self, physics: protocols.Physics, where: axes.Mask) -> None:
     """Releases the block in some worlds."""
     axes.assign(physics.bind(self._constraints), 'active', 0, where)
+    if self._welds:
+      axes.assign(physics.bind(self._welds), 'active', 0, where)
+
+  def turn_along(self, physics: protocols.Physics, is_held: np.ndarray) -> None:
+    """Turns the block with the hand where it is held, `(...)` bool.
+
+    It does nothing for other blocks. Writes can turn a held block, so it is
+    called in each control step.
+    """
+    if not self._welds:
+      return
+    hand, block = (
+        np.reshape(matrix, (*matrix.shape[:-1], 3, 3))
+        for matrix in (physics.bind(end).xmat for end in self._ends)
+    )
+    (x, y, _), (x_of_block, y_of_block, _) = (
+        np.moveaxis(matrix, -1, 0) for matrix in (hand, block)
+    )
+    cos = (x * x_of_block + y * y_of_block).sum(axis=-1)
+    sin = (y * x_of_block - x * y_of_block).sum(axis=-1)
+    nearest = np.argmax(np.stack([cos, sin, -cos, -sin], axis=-1), axis=-1)
+    is_nearest = np.arange(_NUM_WELDS) == nearest[..., np.newaxis]
+    active = np.asarray(is_held)[..., np.newaxis] & is_nearest
+    physics.bind(self._welds).active = active
 
   def is_anywhere_held(self, physics: protocols.Physics) -> bool:
     """Returns True if the hand holds the block in any world."""

@@ -22,6 +22,14 @@ _KINDS = _REWARD._replace(
         'registers.score.kind=block_orientation',
     )
 )
+# Hands turn blocks.
+_TURNS = _REWARD._replace(
+    overrides=(
+        'dof=planar',
+        'registers.reward.kind=block_orientation',
+        'registers.score.kind=block_orientation',
+    )
+)
 # A provider draws at random in every step, from a large seed.
 _DRAWING = identity.Case(
     'unlock_door',
@@ -73,6 +81,12 @@ if examples.IS_LONG:
 )
 def test_a_batch_equals_its_worlds_with_ledgers_and_state(case):
   assert identity.compare(case, _FEW_STEPS).differences == ()
+
+
+def test_a_batch_with_held_blocks_that_turn_equals_its_worlds():
+  result = identity.compare(_TURNS, _STEPS)
+  assert result.differences == ()
+  assert result.num_held > 0
 
 
 def test_compared_runs_contain_ends_rewards_and_corruption():

@@ -73,6 +73,80 @@ def test_a_block_that_is_stuck_stays_behind(dof, size, mass, keeps_hold):
   assert world.holding is keeps_hold
 
 
+def _turned(angle: float) -> float:
+  """Returns an angle within half a turn."""
+  return float(np.arctan2(np.sin(angle), np.cos(angle)))
+
+
+@every_dof
+@pytest.mark.parametrize('written', [0.0, 15.0, -28.0])
+def test_a_held_block_whose_heading_is_read_turns_with_the_hand(dof, written):
+  world = avatar_worlds.make(registers.BlockOrientationRegister, dof=dof)
+  register, physics = world.register, world.physics
+  world.grasp()
+  register.write(physics, written)
+  yaws = []
+  for steps, commands in (
+      (50, {'turn': 1.0}),
+      # Carried around, and turned back by more than half a turn.
+      (100, {'turn': -1.0, 'strafe': 0.5}),
+      (60, {'turn': -1.0}),
+  ):
+    heading = 0.1 * float(register.read(physics))
+    yaw = float(world.avatar.angle(physics))
+    for _ in range(steps // 10):
+      world.act(10, **commands)
+    # It comes to rest with the hand.
+    world.act(30)
+    assert world.holding
+    yaws.append(float(world.avatar.angle(physics)) - yaw)
+    turned = 0.1 * float(register.read(physics)) - heading
+    assert _turned(turned - yaws[-1]) == pytest.approx(0.0, abs=0.2)
+  assert yaws[0] > 1.0
+  assert yaws[1] + yaws[2] < -np.pi
+  read = register.inspect(physics)
+  assert abs(read.temporary) > 1.0
+  assert read.permanent == 0.0
+  # A write sets the angle, and the hand turns the block on from there.
+  register.write(physics, written)
+  assert float(register.read(physics)) == pytest.approx(written, abs=1e-9)
+  yaw = float(world.avatar.angle(physics))
+  world.act(20, turn=1.0)
+  yaw = float(world.avatar.angle(physics)) - yaw
+  assert yaw > 0.4
+  turned = 0.1 * (float(register.read(physics)) - written)
+  assert _turned(turned - yaw) == pytest.approx(0.0, abs=0.1)
+  # Released, it stays; grasped anew, it turns again.
+  world.act(60, grasp=-1.0)
+  before = float(register.read(physics))
+  world.act(60, turn=-1.0)
+  assert 0.1 * abs(float(register.read(physics)) - before) < 0.02
+  world.grasp()
+  before = float(register.read(physics))
+  world.act(60, turn=1.0)
+  turned = 0.1 * (float(register.read(physics)) - before)
+  assert abs(_turned(turned)) > 1.0
+
+
+def test_a_held_block_of_other_kinds_does_not_turn_with_the_hand():
+  world = avatar_worlds.make(dof='planar')
+  world.grasp()
+  world.act(50, turn=1.0)
+  assert abs(float(world.register.blocks[0].heading(world.physics))) < 0.1
+
+
+def test_a_held_block_that_cannot_turn_does_not_lock_the_avatar():
+  world = avatar_worlds.World(registers.BlockOrientationRegister, dof='planar')
+  world.grasp()
+  physics = world.physics
+  hinge = world.register.mjcf_model.find('joint', 'block_hinge')
+  physics.bind(hinge).damping = 1e4
+  yaw = float(world.avatar.angle(physics))
+  world.act(100, turn=1.0)
+  assert float(world.avatar.angle(physics)) - yaw > 2.0
+  assert abs(float(world.register.read(physics))) < 0.1
+
+
 def test_a_hand_grasps_only_the_nearest_block():
   world = avatar_worlds.make(registers.TwoBlockRegister)
   # The offset block stands at y = 0.25; both are in reach.

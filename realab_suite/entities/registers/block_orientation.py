@@ -22,7 +22,8 @@ class BlockOrientationRegister(base.Register):
   """Register that stores a float as the heading of a block.
 
   The scale is in rad per unit. Turning or toppling the block is a temporary
-  corruption. Carrying the block away without turning it is no corruption.
+  corruption, and the block turns with a hand that holds it. Carrying the block
+  away without turning it is no corruption.
   """
 
   def _build_blocks(self) -> list[block_kinds.Block]:
@@ -33,7 +34,9 @@ class BlockOrientationRegister(base.Register):
           f' {self._scale} turns the block by up to {widest:.3g} rad; must'
           f' be at most {_LARGEST_ANGLE} rad'
       )
-    self._block = self._add_block('block', appearance.OFFSET_BLOCK, (0.0, 0.0))
+    self._block = self._add_block(
+        'block', appearance.OFFSET_BLOCK, (0.0, 0.0), turns_along=True
+    )
     return [self._block]
 
   def _places(

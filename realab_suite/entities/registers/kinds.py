@@ -226,6 +226,7 @@ class Kind(modelled.ModelledEntity):
       position: Sequence[float],
       direction: tuple[float, float] | None = None,
       ports: Sequence[str] = (),
+      turns_along: bool = False,
   ) -> block_kinds.Block:
     """Adds a block with the register's degrees of freedom.
 
@@ -239,6 +240,8 @@ class Kind(modelled.ModelledEntity):
       ports: Ports that depend on the block; all, if none are named. Attribution
         charges permanent corruption of a port to the last mover of its first
         block, and temporary corruption to that of its last one.
+      turns_along: True if the block turns with a hand that holds it, as one
+        whose heading carries a value has to.
     """
     is_free = self._dof == 'free'
     kind = block_kinds.FreeBlock if is_free else block_kinds.PlanarBlock
@@ -253,4 +256,5 @@ class Kind(modelled.ModelledEntity):
         appearance.geom_style(class_name, colour),
         direction,
         ports,
+        turns_along,
     )
