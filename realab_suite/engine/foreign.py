@@ -24,6 +24,7 @@ from realab_suite.engine import hosts
 from realab_suite.engine import observing
 from realab_suite.engine import placement
 from realab_suite.engine import replacement
+from realab_suite.entities import meters
 from realab_suite.entities import views
 from realab_suite.feedback import mechanisms
 
@@ -78,7 +79,8 @@ class ForeignHost(hosts.Host):
   """Host of a foreign task.
 
   The senses that the task offers are the observables that were enabled when it
-  was embedded. Observables that are enabled later are not observed.
+  was embedded, except those of meters and providers. Observables that are
+  enabled later are not observed.
   """
 
   PHYSICS = ForeignPhysics
@@ -114,7 +116,7 @@ class ForeignHost(hosts.Host):
     selected = {
         name: observable
         for name, observable in self._task.observables.items()
-        if observable.enabled
+        if observable.enabled and not isinstance(observable, meters.Unseen)
     }
     if senses is not None:
       observing.refuse_unknown(senses, [*selected, observing.TIME_LEFT])

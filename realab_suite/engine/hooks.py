@@ -6,6 +6,7 @@ from dm_control import composer
 from dm_control.composer import environment as composer_environment
 
 from realab_suite import errors
+from realab_suite.feedback import composer_hooks
 from realab_suite.tasks import base
 
 # Tasks of this package are compiled once and run no Python in substeps.
@@ -39,13 +40,19 @@ def refuse_uncalled(task: composer.Task) -> None:
   """Refuses a task of this package with hooks that the engine never calls.
 
   Raises:
-    SpecError: If the task or one of its entities has such a hook.
+    SpecError: If the task or one of its entities has such a hook, or a provider
+      is attached by itself, whose state no snapshot would contain.
   """
   if not isinstance(task, base.Task):
     return
   parts: list[tuple[Any, type]] = [(task, composer.Task)]
   parts += [(e, composer.Entity) for e in task.root_entity.iter_entities()]
   for part, kind in parts:
+    if isinstance(part, composer_hooks.ProviderHooks):
+      raise errors.SpecError(
+          f'{part.mjcf_model.model}: a provider by itself acts in environments'
+          f' of Composer; must be in the design of {type(task).__name__}'
+      )
     for hook in _NEVER_CALLED:
       if getattr(type(part), hook) is not getattr(kind, hook):
         raise errors.SpecError(

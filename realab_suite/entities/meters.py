@@ -39,6 +39,11 @@ class Instrument:
 
 
 @final
+class Unseen(observable.Generic):
+  """An observable for evaluators, which no agent of this package gets."""
+
+
+@final
 class Meter(modelled.ModelledEntity):
   """Measures the true state of the world and writes it to a meter register.
 
@@ -76,7 +81,7 @@ class Meter(modelled.ModelledEntity):
     self._mjcf_root = mjcf_model or mjcf.RootElement(
         model=f'meter_{register.name}'
     )
-    self._hooks = _Hooks(self) if mjcf_model is None else None
+    self._hooks = MeterHooks(self) if mjcf_model is None else None
 
   def iter_entities(
       self, exclude_self: bool = False
@@ -90,7 +95,7 @@ class Meter(modelled.ModelledEntity):
     observables = super()._build_observables()
     observables.add_observable(
         f'measured_{self._register.name}',
-        observable.Generic(self.measure),
+        Unseen(self.measure),
         enabled=False,
     )
     return observables
@@ -147,18 +152,34 @@ class Meter(modelled.ModelledEntity):
 
 
 @final
-class _Hooks(composer.Entity):
+class MeterHooks(composer.Entity):
   """Lets a meter measure at the end of each control step of Composer."""
 
   def _build(self, meter: Meter) -> None:
     self._meter = meter
+    self._is_due = False
 
   @property
   def mjcf_model(self) -> mjcf.RootElement:
     return self._meter.mjcf_model
 
+  def before_step(
+      self, physics: protocols.Physics, random_state: np.random.RandomState
+  ) -> None:
+    del physics, random_state
+    self._is_due = True
+
   def after_step(
       self, physics: protocols.Physics, random_state: np.random.RandomState
   ) -> None:
     del random_state
-    self._meter.update(physics)
+    self.measure_once(physics)
+
+  def measure_once(self, physics: protocols.Physics) -> None:
+    """Measures, unless the meter has done so in this control step.
+
+    Providers call it, because Composer may call their hooks first.
+    """
+    if self._is_due:
+      self._is_due = False
+      self._meter.update(physics)

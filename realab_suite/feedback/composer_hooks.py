@@ -1,15 +1,18 @@
-"""Hooks that run a mechanism in a plain environment of Composer.
+"""Hooks that run mechanisms and providers in a plain environment of Composer.
 
 Composer calls the hooks of entities in the order of attachment and passes them
 neither the action nor the agent's observation. A mechanism that is attached to
 an arena therefore runs designs that need only registers and meters;
 `suite.embed` runs all of them.
 
-The phases run before a substep. All entities have then seen the result of the
-previous one, so it does not matter whether the mechanism was attached before or
-after them.
+The phases of a mechanism run before a substep. All entities have then seen the
+result of the previous one, so it does not matter whether the mechanism was
+attached before or after them. A provider by itself acts at the end of a control
+step, and before that lets the meters by themselves measure.
 """
 
+import abc
+from collections.abc import Sequence
 from typing import Any, final
 
 from dm_control import composer
@@ -17,7 +20,11 @@ from dm_control import mjcf
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.entities import meters
+from realab_suite.entities import state
 from realab_suite.entities import views
+from realab_suite.entities.registers import ports
+from realab_suite.feedback import phases as feedback_phases
 from realab_suite.feedback import specs
 
 # Measurement of the true return, which only the task's environment gets.
@@ -26,32 +33,22 @@ _SCORE = 'score'
 _MANY = 10**9
 
 
-@final
-class ComposerHooks(composer.Entity):
-  """Runs the phases of a mechanism from Composer's hooks.
+class _Hooks(composer.Entity, abc.ABC):
+  """Base class for the hooks of an entity with providers.
 
   It has the state of the current episode that is not physical: the states and
   random keys of the providers.
   """
 
-  def _build(self, mechanism: Any, num_substeps: int | None) -> None:
-    """Makes the hooks of a mechanism.
-
-    Args:
-      mechanism: The `FeedbackMechanism`.
-      num_substeps: Number of substeps in a control step, if it is known.
-    """
-    self._mechanism = mechanism
-    self._num_substeps = num_substeps
-    self._schedule: specs.ScheduleSpec | None = None
-    if num_substeps is not None or mechanism.design.schedule is not None:
-      self._schedule = mechanism.design.schedule_for(num_substeps or _MANY)
-    self._is_connected = False
-    self._view: Any = None
+  def _start(
+      self, owner: Any, title: str, phases: feedback_phases.Phases
+  ) -> None:
+    """Initializes the hooks, given the entity that they belong to."""
+    self._owner = owner
+    self._title = title
+    self._phases = phases
     # MuJoCo's data of the world that was compiled last.
     self._data: Any = None
-    # Substeps of the current control step so far.
-    self._num_done = 0
     # Of the current episode; the physics contains the rest of its state.
     self._episode = -1
     self._keys: Any = None
@@ -60,8 +57,84 @@ class ComposerHooks(composer.Entity):
 
   @property
   def mjcf_model(self) -> mjcf.RootElement:
-    model: mjcf.RootElement = self._mechanism.mjcf_model
+    model: mjcf.RootElement = self._owner.mjcf_model
     return model
+
+  def initialize_episode(
+      self, physics: Any, random_state: np.random.RandomState
+  ) -> None:
+    del physics, random_state
+    self._episode += 1
+    self._keys = None
+    self._states = self._phases.initial_states(())
+
+  def _begin_step(
+      self, physics: Any, random_state: np.random.RandomState, *stream: int
+  ) -> None:
+    """Draws random keys in the first step of an episode.
+
+    Args:
+      physics: Physics of the step.
+      random_state: Generator of the task.
+      *stream: Numbers that distinguish the keys from those of other hooks.
+
+    Raises:
+      SpecError: If the physics is not that of the world that was compiled last.
+    """
+    if self._keys is None:
+      self._keys = self._draw_keys(random_state, stream)
+    if physics.data.ptr is not self._data:
+      raise errors.SpecError(
+          f'{self._title}: the task is in two environments, and the registers'
+          ' are in the one that was made last; make a task for each environment'
+      )
+
+  def _observe(self, physics: Any) -> None:
+    """Reads the registers that the agent's action responds to."""
+    self._observation = {
+        f'registers/{read.register}': np.array(read.reading)
+        for read in self._phases.read_for_agent(physics)
+    }
+
+  def _draw_keys(
+      self, random_state: np.random.RandomState, stream: Sequence[int]
+  ) -> np.ndarray:
+    """Returns the random key of each provider, `(providers, 2)` uint64.
+
+    The generator of the task is not advanced, so its episodes stay the same.
+    """
+    copy = np.random.RandomState()
+    copy.set_state(random_state.get_state())
+    entropy = [self._episode, *copy.randint(2**31, size=4).tolist(), *stream]
+    number = len(self._states)
+    words = np.random.SeedSequence(entropy).generate_state(
+        2 * number, np.uint64
+    )
+    return words.reshape(number, 2)
+
+
+@final
+class ComposerHooks(_Hooks):
+  """Runs the phases of a mechanism from Composer's hooks."""
+
+  def _build(self, mechanism: Any, num_substeps: int | None) -> None:
+    """Makes the hooks of a mechanism.
+
+    Args:
+      mechanism: The `FeedbackMechanism`.
+      num_substeps: Number of substeps in a control step, if it is known.
+    """
+    title = f'design {mechanism.design.name!r}'
+    self._start(mechanism, title, mechanism.phases)
+    self._mechanism = mechanism
+    self._num_substeps = num_substeps
+    self._schedule: specs.ScheduleSpec | None = None
+    if num_substeps is not None or mechanism.design.schedule is not None:
+      self._schedule = mechanism.design.schedule_for(num_substeps or _MANY)
+    self._is_connected = False
+    self._view: Any = None
+    # Substeps of the current control step so far.
+    self._num_done = 0
 
   def after_compile(
       self, physics: Any, random_state: np.random.RandomState
@@ -79,39 +152,21 @@ class ComposerHooks(composer.Entity):
     self._data = physics.data.ptr
     self._view = views.View(physics)
 
-  def initialize_episode(
-      self, physics: Any, random_state: np.random.RandomState
-  ) -> None:
-    del physics, random_state
-    self._episode += 1
-    self._keys = None
-    self._states = self._mechanism.phases.initial_states(())
-
   def before_step(
       self, physics: Any, random_state: np.random.RandomState
   ) -> None:
     """Reads the registers that the agent's action responds to."""
-    if self._keys is None:
-      self._keys = self._draw_keys(random_state)
+    self._begin_step(physics, random_state)
     self._num_done = 0
-    if physics.data.ptr is not self._data:
-      raise errors.SpecError(
-          f'design {self._mechanism.design.name!r}: the task is in two'
-          ' environments, and the registers are in the one that was made last;'
-          ' make a task for each environment'
-      )
     self._view.open(physics)
-    self._observation = {
-        f'registers/{read.register}': np.array(read.reading)
-        for read in self._mechanism.phases.read_for_agent(self._view)
-    }
+    self._observe(self._view)
 
   def before_substep(
       self, physics: Any, random_state: np.random.RandomState
   ) -> None:
     """Runs the phases that follow the substeps so far."""
     del random_state
-    now, phases, view = self._num_done, self._mechanism.phases, self._view
+    now, phases, view = self._num_done, self._phases, self._view
     meter_substep, provider_substep = self._substeps
     if now not in (meter_substep, provider_substep):
       return
@@ -149,7 +204,7 @@ class ComposerHooks(composer.Entity):
           f'num_substeps: {expected}; must be {done}, as in a control step'
           ' of this environment'
       )
-    self._mechanism.phases.end_step(physics, 0.0)
+    self._phases.end_step(physics, 0.0)
 
   @property
   def _substeps(self) -> tuple[int, int]:
@@ -171,11 +226,14 @@ class ComposerHooks(composer.Entity):
     """
     mechanism = self._mechanism
     name, _ = mechanism.design.name, self._substeps
-    if needs := _needs(mechanism):
-      raise errors.SpecError(
-          f'design {name!r} needs {", ".join(needs)}, which entities of'
-          ' Composer do not get; use suite.embed(task, design)'
-      )
+    needs = _needs(mechanism.design)
+    if not mechanism.is_connected:
+      needs += [
+          'the score (mechanism.connect({"score": function}) offers one)'
+          for meter in mechanism.design.meters
+          if meter.measures == _SCORE
+      ]
+    refuse(self._title, needs)
     outside = [n for n, r in mechanism.registers.items() if r.parent is None]
     if outside:
       raise errors.SpecError(
@@ -186,41 +244,123 @@ class ComposerHooks(composer.Entity):
       mechanism.connect({})
     mechanism.observables.enable_all()
 
-  def _draw_keys(self, random_state: np.random.RandomState) -> np.ndarray:
-    """Returns the random key of each provider, `(providers, 2)` uint64.
 
-    The generator of the task is not advanced, so its episodes stay the same.
+@final
+class ProviderHooks(_Hooks):
+  """Lets a provider act at the end of each control step of Composer."""
+
+  def _build(self, provider: Any, design: specs.DesignSpec) -> None:
+    """Makes the hooks of a provider.
+
+    Args:
+      provider: The `FeedbackProvider`.
+      design: Design of the provider alone.
+
+    Raises:
+      SpecError: If it needs what entities of Composer do not get.
     """
-    copy = np.random.RandomState()
-    copy.set_state(random_state.get_state())
-    entropy = [self._episode, *copy.randint(2**31, size=4).tolist()]
-    number = len(self._mechanism.design.providers)
-    words = np.random.SeedSequence(entropy).generate_state(
-        2 * number, np.uint64
+    refuse(provider.title, _needs(design))
+    self._written = [target.register for target in provider.targets]
+    read = [getattr(port, 'register', port) for port in provider.reads]
+    self._used = [*dict.fromkeys([*self._written, *read])]
+    every = [port for one in self._used for port in ports.of(one)]
+    named = {port.name: port for port in every}
+    if len(named) < len(every):
+      raise errors.SpecError(
+          f'{provider.title}: two of its registers have a name in common; each'
+          ' must have its own'
+      )
+    counters = state.Slots(provider.mjcf_model, step_count=None, score=None)
+    phases = feedback_phases.Phases(design, named, counters, (), [provider])
+    self._start(provider, provider.title, phases)
+    # Hooks of the meters in the world that was compiled last.
+    self._meters: list[meters.MeterHooks] = []
+
+  def after_compile(
+      self, physics: Any, random_state: np.random.RandomState
+  ) -> None:
+    """Finds the meters of a newly compiled world.
+
+    Raises:
+      SpecError: If a register of the provider is not in the world, or has
+        another writer.
+    """
+    del random_state
+    self._data = physics.data.ptr
+    root = self._owner
+    while root.parent is not None:
+      root = root.parent
+    entities = [*root.iter_entities()]
+    self._meters = [e for e in entities if isinstance(e, meters.MeterHooks)]
+    writers = [
+        *(e.register for e in entities if isinstance(e, meters.Meter)),
+        *(
+            target.register
+            for e in entities
+            if isinstance(e, type(self._owner)) and e is not self._owner
+            for target in e.targets
+        ),
+    ]
+    for register in self._used:
+      problem = ''
+      if register not in entities:
+        problem = 'is not in the world; must be attached to the arena'
+      elif register in self._written and register in writers:
+        problem = 'has another writer in the world; must have one'
+      if problem:
+        raise errors.SpecError(
+            f'{self._title}: register {register.name!r} {problem}'
+        )
+
+  def before_step(
+      self, physics: Any, random_state: np.random.RandomState
+  ) -> None:
+    self._begin_step(physics, random_state, *self._title.encode())
+    self._observe(physics)
+
+  def after_step(
+      self, physics: Any, random_state: np.random.RandomState
+  ) -> None:
+    """Lets the meters measure that have not yet, and then the provider act."""
+    del random_state
+    for meter in self._meters:
+      meter.measure_once(physics)
+    log, self._states = self._phases.update_providers(
+        physics, self._observation, self._keys, self._states
     )
-    return words.reshape(number, 2)
+    self._phases.end_step(physics, 0.0)
+    if log:
+      # Composer steps from derived quantities, which have to be up to date.
+      physics.forward()
 
 
-def _needs(mechanism: Any) -> list[str]:
+def refuse(title: str, needs: Sequence[str]) -> None:
+  """Raises a SpecError if something is needed that Composer does not pass."""
+  if needs:
+    needed = ', '.join(dict.fromkeys(needs))
+    raise errors.SpecError(
+        f'{title} needs {needed}, which entities of Composer do not get; use'
+        ' suite.embed(task, design)'
+    )
+
+
+def needs_of(provider: Any) -> list[str]:
+  """Returns what a provider needs that Composer does not pass to entities."""
+  needs = [f'the sense {sense!r}' for sense in provider.sensed]
+  if provider.action_queries or provider.action_writes:
+    needs.append('the action')
+  return needs
+
+
+def _needs(design: specs.DesignSpec) -> list[str]:
   """Returns what a design needs that Composer does not pass to entities."""
-  design = mechanism.design
   needs = [f'the query {name!r} of an action' for name in design.names('query')]
   if design.action_set is not None:
     needs.append('the action')
-  needs += [
-      f'the sense {sense!r}'
-      for provider in design.providers
-      for sense in provider.sensed
-  ]
-  needs += [
+  for provider in design.providers:
+    needs += needs_of(provider)
+  return needs + [
       f'the end of the episode by {name!r}'
       for name, port in design.ports.items()
       if port.ends_episode is not None
   ]
-  if not mechanism.is_connected:
-    needs += [
-        'the score (mechanism.connect({"score": function}) offers one)'
-        for meter in design.meters
-        if meter.measures == _SCORE
-    ]
-  return list(dict.fromkeys(needs))

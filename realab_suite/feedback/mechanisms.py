@@ -93,12 +93,12 @@ class FeedbackMechanism(modelled.ModelledEntity):
     self._asked: list[measurements.AskedRegisters] = []
     self._providers = [
         provider_entities.FeedbackProvider(
-            f'providers[{i}]:{spec.kind}',
             spec,
-            self._mjcf_root,
             [self._ports[name] for name in spec.reads],
-            self._targets(spec.writes),
-            self._read_by_agent,
+            [target.register for target in self._targets(spec.writes)],
+            title=f'providers[{i}]:{spec.kind}',
+            mjcf_model=self._mjcf_root,
+            read_by_agent=self._read_by_agent,
         )
         for i, spec in enumerate(design.providers)
     ]

@@ -20,7 +20,6 @@ from realab_suite.entities import state
 from realab_suite.entities.registers import ports as register_ports
 from realab_suite.entities.registers import records
 from realab_suite.feedback import clean_contents
-from realab_suite.feedback import provider_entities
 from realab_suite.feedback import provider_results
 from realab_suite.feedback import providers
 from realab_suite.feedback import register_writes
@@ -45,7 +44,7 @@ class Phases:
       ports: Mapping[str, register_ports.AnyPort],
       counters: state.Slots,
       queries: Sequence[register_writes.Target],
-      of_providers: Sequence[provider_entities.FeedbackProvider],
+      of_providers: Sequence[Any],
   ) -> None:
     """Initializes the phases of a mechanism without meters.
 
@@ -54,7 +53,7 @@ class Phases:
       ports: Ports of its registers, by name.
       counters: Slots `step_count` and `score`.
       queries: Registers that the agent writes.
-      of_providers: Providers, in the order of the design.
+      of_providers: `FeedbackProvider`s, in the order of the design.
     """
     self.meters: list[
         tuple[Sequence[str], meters.Meter, register_writes.Target]
@@ -293,7 +292,7 @@ class Phases:
 
   def _call(
       self,
-      provider: provider_entities.FeedbackProvider,
+      provider: Any,
       step: Any,
       inputs: clean_contents.Inputs,
       state: Mapping[str, Any],
@@ -331,7 +330,7 @@ class Phases:
   def _write_all(
       self,
       physics: protocols.Physics,
-      provider: provider_entities.FeedbackProvider,
+      provider: Any,
       step: Any,
       values: Mapping[str, provider_results.RequestedWrite],
       where: axes.Mask,

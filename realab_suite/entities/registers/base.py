@@ -128,6 +128,11 @@ class Register(kinds.Kind):
     return self._low, self._high
 
   @property
+  def initial(self) -> float:
+    """Value at the start of an episode, unless `start_with` sets a function."""
+    return self._initial
+
+  @property
   def blocks(self) -> list[block_kinds.Block]:
     """Blocks of the register; the first one marks its position."""
     return self._blocks

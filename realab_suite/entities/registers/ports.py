@@ -53,6 +53,16 @@ class Port:
     return self._name
 
   @property
+  def register(self) -> base.Register:
+    """Register that the port belongs to."""
+    return self._register
+
+  @property
+  def initial(self) -> float:
+    """Value at the start of an episode; see `Register.initial`."""
+    return self._register.initial
+
+  @property
   def role(self) -> str:
     """Role of the register."""
     return self._register.role
