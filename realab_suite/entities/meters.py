@@ -53,7 +53,7 @@ class Meter(modelled.ModelledEntity):
   It has an observable, which is disabled by default: `measured_` and the name
   of the register. A mechanism decides when its meters measure. A meter that is
   attached by itself, as in `arena.attach(meter)`, does so at the end of each
-  control step of `composer.Environment`, after the task.
+  control step of `composer.Environment`, after the task and before providers.
   """
 
   def _build(
