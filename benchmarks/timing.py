@@ -13,6 +13,8 @@ from unittest import mock
 import mujoco
 import numpy as np
 
+from realab_suite.engine import arguments
+
 Contestant = Callable[[], float]
 """Function that does one round of work and returns the seconds per unit."""
 
@@ -185,7 +187,7 @@ class Figure:
 def report(figures: Sequence[Figure]) -> None:
   """Prints one line per figure."""
   print(
-      f'mujoco {mujoco.__version__}, {os.cpu_count()} cores, load'
+      f'mujoco {mujoco.__version__}, {arguments.processors()} cores, load'
       f' {os.getloadavg()[0]:.1f}; medians of {len(figures[0].samples)} rounds;'
       ' best: the least disturbed round; 25-75 %: quartiles'
   )

@@ -46,8 +46,8 @@ class _View(Uncopied):
     read. Observables that are enabled later are never added.
   - Arrays are copies that belong to the agent.
   - The only exceptions are `ActionError` for an invalid action, `ClosedError`,
-    and `WorldError` for everything else. A `WorldError` contains only a number;
-    it has no cause and no traceback frames of the environment.
+    `ForkError`, and `WorldError` for everything else. A `WorldError` contains
+    only a number. None has a cause or traceback frames of the environment.
   """
 
   # Private names: no public attribute leads to the environment.
@@ -180,6 +180,8 @@ class _View(Uncopied):
       return call()
     except errors.ClosedError:
       problem = _closed()
+    except errors.ForkError as error:  # It is about processes alone.
+      problem = errors.ForkError(str(error))
     except Exception as error:
       problem = errors.WorldError(
           f'error {self.__num_failures} of this view: the world failed; the'

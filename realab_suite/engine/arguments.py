@@ -1,6 +1,7 @@
 """Checks of the arguments for loading, batching and forking worlds."""
 
 from collections.abc import Sequence
+import os
 from typing import Any
 
 import numpy as np
@@ -28,12 +29,20 @@ def num_envs(given: Any) -> int:
 
 
 def num_threads(given: Any) -> int:
-  """Returns a number of threads as an integer; 0 stands for all processors.
+  """Returns a number of threads; 0 stands for one for each of `processors`.
 
   Raises:
     SpecError: If it is not an integer from 0 to 1,024.
   """
-  return integers.check('num_threads', given, 0, _MAX_THREADS)
+  threads = integers.check('num_threads', given, 0, _MAX_THREADS)
+  return threads or min(processors(), _MAX_THREADS)
+
+
+def processors() -> int:
+  """Returns the number of processors that this process may use."""
+  if hasattr(os, 'sched_getaffinity'):  # macOS has no such limits.
+    return len(os.sched_getaffinity(0))
+  return os.cpu_count() or 1
 
 
 def indices(given: Any, num_envs: int) -> np.ndarray:

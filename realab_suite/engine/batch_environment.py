@@ -107,7 +107,7 @@ class BatchEnvironment:
   @property
   def physics(self) -> batch_physics.BatchPhysics:
     """Physics of all worlds, for evaluators; agents do not get it."""
-    self._refuse_if_closed()
+    self._refuse_if_unusable()
     return self._physics
 
   @property
@@ -137,7 +137,7 @@ class BatchEnvironment:
 
   def add_sink(self, sink: events.BatchEventSink) -> None:
     """Abandons the current episodes and notifies a sink of all later ones."""
-    self._refuse_if_closed()
+    self._refuse_if_unusable()
     self._notify_of_ends(~self._is_pending, events.End.ABANDONED)
     self._sinks.append(sink)
     self._is_pending = np.ones(self._num_envs, bool)
@@ -157,7 +157,7 @@ class BatchEnvironment:
     Raises:
       SpecError: If a seed is invalid.
     """
-    self._refuse_if_closed()
+    self._refuse_if_unusable()
     seeds = self._seeds
     if random is not None:
       seeds = seeding.seeds(random, self._num_envs)
@@ -191,7 +191,7 @@ class BatchEnvironment:
     Raises:
       SpecError: If there is no such world.
     """
-    self._refuse_if_closed()
+    self._refuse_if_unusable()
     indices = arguments.indices(worlds, self._num_envs)
     is_first = np.isin(np.arange(self._num_envs), indices)
     was_pending = self._is_pending
@@ -231,7 +231,7 @@ class BatchEnvironment:
       ActionError: If an action does not satisfy `action_spec`; the message
         names the first such world. No world has changed.
     """
-    self._refuse_if_closed()
+    self._refuse_if_unusable()
     queries, controls = self.codec.decode(actions, (self._num_envs,))
     if self._is_pending.all():
       return self.reset()
@@ -351,6 +351,7 @@ class BatchEnvironment:
         The state is unchanged.
       StateLayoutError: If the snapshot does not fit. The state is unchanged.
     """
+    self._refuse_if_unusable()
     header = self._single.snapshot_header(self._physics.model)
     saved = snapshots.WorldStates.from_snapshot(snapshot, header)
     indices = saved.indices_for(worlds, self._num_envs)
@@ -373,7 +374,7 @@ class BatchEnvironment:
       SpecError: If an index is invalid, a source has not begun an episode,
         blocks of this batch can sleep, or a sink cannot be saved.
     """
-    self._refuse_if_closed()
+    self._refuse_if_unusable()
     snapshots.refuse_sleep(self._physics.model)
     indices = arguments.indices(worlds, self._num_envs)
     rows = arguments.sources(sources, len(indices), self._episodes >= 0)
@@ -434,7 +435,7 @@ class BatchEnvironment:
         for the size.
       RenderingError: If no renderer is available, or if it fails.
     """
-    self._refuse_if_closed()
+    self._refuse_if_unusable()
     arguments.camera(camera, self._task.root_entity.mjcf_model)
     indices = arguments.indices(worlds, self._num_envs).tolist()
     return self._physics.render(indices, camera, height, width)
@@ -445,6 +446,9 @@ class BatchEnvironment:
       self._notify_of_ends(~self._is_pending, events.End.ABANDONED)
     self._closed = True
     self._single.close()
+
+  def __reduce__(self) -> Any:
+    return self._single.__reduce__()  # It refuses.
 
   def _begin_episodes(self, where: np.ndarray) -> None:
     """Begins an episode in each world where the mask `(worlds,)` is True."""
@@ -522,6 +526,7 @@ class BatchEnvironment:
         observing.copied(observing.frozen(self._observation)),
     )
 
-  def _refuse_if_closed(self) -> None:
+  def _refuse_if_unusable(self) -> None:
     if self._closed:
       raise errors.ClosedError('this environment is closed; load another one')
+    self._physics.refuse_forks()

@@ -8,15 +8,20 @@ Its state arrays are live. Derived quantities are updated when they are read.
 import abc
 from collections.abc import Iterable
 import copy
+import ctypes
 import functools
 import operator
+import os
 from typing import Any, final
+import weakref
 
 from dm_control import mjcf
 import mujoco
 from mujoco import batch as mujoco_batch
 import numpy as np
 
+from realab_suite import errors
+from realab_suite.engine import arguments
 from realab_suite.engine import single_physics
 from realab_suite.entities import cameras
 from realab_suite.entities import protocols
@@ -54,6 +59,8 @@ _DERIVED_FIELDS = {
     ('body', 'cvel'): 'cvel',
     ('body', 'subtree_com'): 'subtree_com',
 }
+# MuJoCo's batches with threads, which only the process that made them has.
+_threaded: weakref.WeakSet[Any] = weakref.WeakSet()
 
 
 @final
@@ -78,7 +85,8 @@ class BatchPhysics:
       sleep: True to let blocks at rest sleep.
     """
     self._template = template
-    self._num_threads = num_threads
+    self._num_threads = arguments.num_threads(num_threads)
+    self._process = os.getpid()
     self._model = template.model
     if sleep:
       # The compiled model specifies which bodies may sleep: all except the
@@ -87,9 +95,7 @@ class BatchPhysics:
       self._model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
     # MuJoCo's state does not contain which bodies sleep. A persistent batch
     # keeps this, because it keeps all data of each world between steps.
-    self._batch = mujoco_batch.Batch(
-        self._model.ptr, num_envs, num_threads, persistent=sleep
-    )
+    self._batch = self._new_batch(self._model, num_envs, sleep)
     self._data = _Data(self._batch.bind('userdata'), self._batch.bind('time'))
     self._bindings: dict[Any, _BatchBinding] = {}
     self._is_dirty = True
@@ -105,7 +111,32 @@ class BatchPhysics:
     """
     still = copy.copy(self._template.model)
     still.opt.disableflags |= int(_NEEDLESS)
-    return mujoco_batch.Batch(still.ptr, self.num_envs, self._num_threads)
+    return self._new_batch(still, self.num_envs)
+
+  def _new_batch(
+      self, model: Any, num_envs: int, persistent: bool = False
+  ) -> mujoco_batch.Batch:
+    """Returns a new batch of MuJoCo."""
+    batch = mujoco_batch.Batch(
+        model.ptr, num_envs, self._num_threads, persistent
+    )
+    if batch.nthread > 1:
+      _threaded.add(batch._b)
+    return batch
+
+  def refuse_forks(self) -> None:
+    """Refuses the use of threads that only the parent of this process has.
+
+    Raises:
+      ForkError: If this process was forked after the batch was made.
+    """
+    if os.getpid() != self._process and self._batch.nthread > 1:
+      raise errors.ForkError(
+          f'this batch: process {self._process} made it before it forked this'
+          f' one, which lacks its {self._batch.nthread} threads and would wait'
+          ' for them; load the batch in this process, or with num_threads=1,'
+          ' or start processes with spawn'
+      )
 
   @property
   def num_envs(self) -> int:
@@ -145,6 +176,7 @@ class BatchPhysics:
 
   def forward(self) -> None:
     """Updates the poses of bodies, geoms and sites."""
+    self.refuse_forks()
     self._poses.state[:] = self._batch.state
     self._poses.forward(stage=self._stage)
     self._is_dirty = False
@@ -166,6 +198,7 @@ class BatchPhysics:
 
   def advance(self, num_substeps: int) -> None:
     """Steps every world from its present state."""
+    self.refuse_forks()
     self._batch.step(nstep=num_substeps)
     self._is_dirty = True
 
@@ -174,6 +207,7 @@ class BatchPhysics:
 
     Derived quantities are not updated.
     """
+    self.refuse_forks()
     self._batch.reset(worlds, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
     self._batch.warning[worlds] = 0
     self._is_dirty = True
@@ -438,3 +472,12 @@ class _WorldBinding(_Binding):
     field, index = self._binding.part(name)
     field[self._world, index] = value
     self._binding.mark_as_dirty()
+
+
+def _leave_threads() -> None:
+  """Keeps batches in a forked process, as freeing them would join threads."""
+  for batch in _threaded:
+    ctypes.pythonapi.Py_IncRef(ctypes.py_object(batch))
+
+
+os.register_at_fork(after_in_child=_leave_threads)

@@ -7,7 +7,6 @@ The same command continues an interrupted sweep. Finished jobs are not repeated,
 and the failure of one job does not stop the others.
 """
 
-import os
 import pathlib
 
 from absl import flags as absl_flags
@@ -39,7 +38,7 @@ _WORKERS = absl_flags.DEFINE_integer(
     'workers',
     None,
     'Number of jobs in parallel with --engine=local. Default: the number of'
-    ' processors.',
+    ' processors that this process may use.',
     lower_bound=1,
 )
 _ENGINE = absl_flags.DEFINE_enum(
@@ -57,6 +56,7 @@ def main() -> None:
   threads.use_one()
   flags.prepare()
   # Imports numerical libraries, so the number of threads has to be set first.
+  from realab_suite.engine import arguments
   from realab_suite.lab.experiments import engines
   from realab_suite.lab.experiments import experiment_specs
   from realab_suite.lab.experiments import jobs
@@ -79,7 +79,9 @@ def main() -> None:
       if not (folder / job.folder() / storage.DONE).exists()
   ]
   training.rehearse(unfinished, name)
-  engine = engines.ENGINES[_ENGINE.value](_WORKERS.value or os.cpu_count() or 1)
+  engine = engines.ENGINES[_ENGINE.value](
+      _WORKERS.value or arguments.processors()
+  )
   scheduler.sweep(
       experiment,
       folder,

@@ -8,10 +8,11 @@ from stable_baselines3.common import vec_env
 from realab_suite import errors
 from realab_suite.doors.gymnasium import interfaces
 from realab_suite.doors.gymnasium import vector
+from realab_suite.engine import agent_view
 
 
 @final
-class RealabVecEnv(vec_env.VecEnv):
+class RealabVecEnv(agent_view.Uncopied, vec_env.VecEnv):
   """A `RealabVectorEnv` as a `VecEnv` of Stable-Baselines3.
 
       envs = gym.make_vec(name, num_envs=64, autoreset_mode='SameStep')

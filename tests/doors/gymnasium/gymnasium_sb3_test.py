@@ -1,5 +1,6 @@
 """Worlds in Stable-Baselines3, where it is installed."""
 
+import copy
 from typing import Any
 
 import gymnasium as gym
@@ -33,6 +34,11 @@ def _make(mode: str = 'SameStep', **options: Any) -> Any:
 
 def test_their_checker_has_no_warnings():
   env_checker.check_env(gym.make(_NAME, **_OPTIONS).unwrapped)
+
+
+def test_worlds_are_not_copied():
+  with pytest.raises(TypeError, match='cannot be pickled or copied'):
+    copy.copy(sb3.RealabVecEnv(_make()))
 
 
 def test_options_of_resets_are_refused():
