@@ -22,7 +22,9 @@ def preserved() -> Iterator[None]:
   registries = [
       measurements.MEASUREMENTS,
       objectives.OBJECTIVES,
+      objectives.PAYMENTS,
       policies.POLICIES,
+      policies.VALUE_FUNCTIONS,
       providers.PROVIDERS,
       register_kinds.REGISTER_KINDS,
       action_sets.ACTION_SETS,

@@ -6,11 +6,19 @@ are asked for, so that a program imports only what its designs name.
 """
 
 from collections.abc import Callable, Iterator, Mapping
+import functools
 import importlib
-from typing import Generic, TypeVar, final
+import types
+from typing import Any, Generic, TypeVar, final
 
 from realab_suite import errors
 from realab_suite.config import messages
+
+HOW_TO_REPLACE = (
+    'choose another name, or define it again in the same module, with the same'
+    ' name and not inside a function'
+)
+"""What to do about a name that is taken, for messages."""
 
 T = TypeVar('T')
 
@@ -36,16 +44,16 @@ class Registry(Generic[T]):
     """Returns a decorator that registers a class or function as `name`.
 
     Raises:
-      SpecError: If the name is taken.
+      SpecError: If the name is taken, and not by an earlier definition of the
+        same; see `is_same`.
     """
 
     def decorate(entry: T) -> T:
       self._import(name)
-      if name in self._entries:
+      if name in self._entries and not is_same(self._entries[name], entry):
         raise errors.SpecError(
             f'{self._what} {name!r} is registered already, as'
-            f' {messages.quote(self._entries[name])}; choose another name;'
-            ' in a notebook, run the cell that registers it once'
+            f' {messages.quote(self._entries[name])}; {HOW_TO_REPLACE}'
         )
       self._entries[name] = entry
       return entry
@@ -82,3 +90,25 @@ class Registry(Generic[T]):
     """Imports the module that registers an entry of the package, if any."""
     if name in self._modules:
       importlib.import_module(self._modules[name])
+
+
+def is_same(old: Any, new: Any) -> bool:
+  """Returns whether an entry is another one, defined again.
+
+  So a cell of a notebook may run twice, and a module may be reloaded: what is
+  made from now on is of the new class. Classes and functions are the same if
+  their modules and qualified names are. What a function defines, and lambdas,
+  may be different things of one name, and are not.
+  """
+  origin = _origin(new)
+  return old is new or (origin is not None and origin == _origin(old))
+
+
+def _origin(entry: Any) -> tuple[str, str] | None:
+  """Returns the module and qualified name of an entry, or `None`."""
+  while isinstance(entry, functools.partial):
+    entry = entry.func
+  if not isinstance(entry, type | types.FunctionType):
+    return None
+  name = entry.__qualname__
+  return None if '<' in name else (entry.__module__, name)

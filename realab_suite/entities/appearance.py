@@ -91,8 +91,8 @@ def register(
       colour of its own.
 
   Raises:
-    SpecError: If the name or the code is taken, or if an argument has a value
-      that is not allowed.
+    SpecError: If the name or the code is that of another class, or if an
+      argument has a value that is not allowed.
   """
   if not (isinstance(name, str) and name):
     raise errors.SpecError(
@@ -100,6 +100,8 @@ def register(
     )
   where = f'class of objects {name!r:.80}'
   if name in _CLASSES:
+    if _CLASSES[name] == _Class(code, _checked_colour(where, rgba)):
+      return name
     raise errors.SpecError(
         f'{where}: registered already, with code {_CLASSES[name].code}; must'
         ' be a new name'

@@ -10,7 +10,6 @@ from realab_suite.config import messages
 from realab_suite.entities import arenas
 from realab_suite.entities import measurables
 from realab_suite.entities.registers import base
-from realab_suite.feedback import register_kinds
 from realab_suite.feedback import specs
 
 
@@ -27,7 +26,6 @@ def make_register(
   Raises:
     SpecError: If the register kind refuses its arguments.
   """
-  kind = register_kinds.REGISTER_KINDS.get(spec.kind)
   arguments = spec.model_copy(
       update={
           'channel': design.channel_of(name),
@@ -36,7 +34,7 @@ def make_register(
   )
   location = messages.Location(f'design {design.name!r}', ('registers', name))
   try:
-    return kind(name, arguments=arguments, **spec.options)
+    return spec.register_class(name, arguments=arguments, **spec.options)
   except errors.SpecError as error:
     raise location.error(str(error)) from error
   except Exception as error:  # Register kinds may raise any class.

@@ -111,6 +111,16 @@ class RegisterSpec(arguments.Arguments):
       return {'position': place}
     return place
 
+  @functools.cached_property
+  def register_class(self) -> type[registers.Register]:
+    """Class of the register when the spec was made; it may be replaced."""
+    return register_kinds.REGISTER_KINDS.get(self.kind)
+
+  @pydantic.model_validator(mode='after')
+  def _find_class(self) -> 'RegisterSpec':
+    _ = self.register_class
+    return self
+
   @pydantic.model_validator(mode='after')
   def _ends_episodes(self) -> 'RegisterSpec':
     if self.ends_episode is None:
@@ -305,9 +315,8 @@ class DesignSpec(validation.Spec):
   @functools.cached_property
   def ports_by_register(self) -> dict[str, list[str]]:
     """Names of the ports of each register, by its name."""
-    kinds = register_kinds.REGISTER_KINDS
     return {
-        name: ports.names(name, kinds.get(spec.kind))
+        name: ports.names(name, spec.register_class)
         for name, spec in self.registers.items()
     }
 

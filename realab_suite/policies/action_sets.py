@@ -153,8 +153,10 @@ def register(actions: ActionSet) -> ActionSet:
   """Registers an action set, and returns it.
 
   Raises:
-    SpecError: If a set of this name and version exists.
+    SpecError: If another set of this name and version exists.
   """
+  if actions.key in ACTION_SETS and ACTION_SETS.get(actions.key) == actions:
+    return actions
   return ACTION_SETS.add(actions.key)(actions)
 
 

@@ -15,6 +15,7 @@ from typing import Any, Final, TypeVar
 from realab_suite import errors
 from realab_suite import tasks
 from realab_suite.config import messages
+from realab_suite.config import registry
 from realab_suite.tasks import base
 from realab_suite.tasks import layouts
 
@@ -45,8 +46,8 @@ def register_task(
     *tags: Tags of the task; see `suite.get_tasks_by_tag`.
 
   Raises:
-    SpecError: If a name is not a string, or if the decorator is used for a task
-      that is registered already.
+    SpecError: If a name is not a string, or if it is that of another task; see
+      `config.registry.is_same`.
   """
   for name in (domain_name, task_name):
     if not isinstance(name, str):
@@ -56,12 +57,13 @@ def register_task(
 
   def decorate(factory: _Factory) -> _Factory:
     _import(domain_name)
-    if (domain_name, task_name) in _TASKS:
+    name = domain_name, task_name
+    if name in _TASKS and not registry.is_same(_TASKS[name][0], factory):
       raise errors.SpecError(
-          f'task {domain_name}.{task_name} is registered already; choose'
-          ' another name; in a notebook, run the cell that registers it once'
+          f'task {domain_name}.{task_name} is registered already;'
+          f' {registry.HOW_TO_REPLACE}'
       )
-    _TASKS[domain_name, task_name] = factory, frozenset(tags)
+    _TASKS[name] = factory, frozenset(tags)
     return factory
 
   return decorate
