@@ -3,7 +3,7 @@ r"""Says what works in this installation, and how to repair what does not.
   python -m realab_suite.launchers.doctor
 
 The exit status is 0 if worlds can be loaded and stepped, and 1 if not.
-Rendering is optional. Programs name an extra that they miss.
+Learners and rendering are optional. Programs name an extra that they miss.
 """
 
 from importlib import metadata
@@ -12,6 +12,7 @@ import platform
 
 from realab_suite import sources
 from realab_suite.config import documents
+from realab_suite.lab.experiments import requirements
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
 
@@ -31,9 +32,20 @@ env = suite.load('unlock_door', 'near', {'random': 0},
 env.reset()
 env.step(0.0 * env.action_spec().minimum)
 """
+_MAKES_A_LEARNER = """
+from realab_suite import suite
+from realab_suite.lab import agents
+env = suite.load('unlock_door', 'near', design='instantaneous_reward')
+learner = agents.make(env.mechanism.design.learner, env.observation_spec(),
+                      env.action_spec(), num_envs=1, seed=0)
+"""
 _CORE_REMEDY = (
     'python -m pip install --force-reinstall -e . -c constraints.txt, in the'
     ' clone'
+)
+_LEARNERS_REMEDY = (
+    'change the variable that the problem names, or python -m pip install -e'
+    " '.[agents]' -c constraints.txt, in the clone"
 )
 _RENDERING_REMEDY = (
     'without a display, install EGL (Debian, Ubuntu: sudo apt install libegl1'
@@ -81,6 +93,14 @@ def main() -> int:
     _tell('core', f'cannot step a world: {core}', _CORE_REMEDY)
   else:
     _tell('core', 'works: a world was loaded and stepped')
+  problem = requirements.missing('jax', 'equinox', 'optax', extra='agents')
+  problem = problem or renderers.problem_of(
+      _MAKES_A_LEARNER, 'learner', os.environ
+  )
+  if problem:
+    _tell('learners', f'cannot make one: {problem}', _LEARNERS_REMEDY)
+  else:
+    _tell('learners', 'work: a small one was made')
   problem = renderers.choose_renderer()
   if problem is None:
     _tell('rendering', f'works with MUJOCO_GL={os.environ["MUJOCO_GL"]}')

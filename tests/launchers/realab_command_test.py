@@ -111,6 +111,7 @@ def test_the_version_is_printed(realab, capsys):
 
 
 def _processes(monkeypatch: Any, status: int, stderr: str = '') -> None:
+  monkeypatch.setattr(doctor.requirements, 'missing', lambda *_, **__: None)
   monkeypatch.setattr(
       subprocess,
       'run',
@@ -128,6 +129,7 @@ def test_a_good_installation(monkeypatch, capsys):
   assert re.match(r'Python 3\.\d+\.\d+, realab-suite ', shown)
   assert 'ok  core       works' in shown
   assert 'ok  rendering  works with MUJOCO_GL=egl\n' in shown
+  assert 'ok  learners   work' in shown
   assert 'to repair' not in shown
 
 
@@ -139,6 +141,7 @@ def test_a_bad_installation(monkeypatch, capsys):
   assert (
       '--  core       cannot step a world: ImportError: no libmujoco' in shown
   )
+  assert '--  learners   cannot make one: ' in shown
   assert '--  rendering  no camera works: MUJOCO_GL=egl (ImportError' in shown
   assert 'apt install libegl1' in shown
 
@@ -147,3 +150,10 @@ def test_the_doctors_world_can_be_stepped():
   names: dict[str, Any] = {}
   exec(compile(doctor._STEPS_A_WORLD, 'doctor', 'exec'), names)
   assert names['env'].physics.time() > 0
+
+
+def test_the_doctors_learner_can_be_made():
+  pytest.importorskip('jax')
+  names: dict[str, Any] = {}
+  exec(compile(doctor._MAKES_A_LEARNER, 'doctor', 'exec'), names)
+  assert names['learner'].num_steps == 0

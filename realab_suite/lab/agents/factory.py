@@ -43,9 +43,10 @@ def make(
     seed: Seed of all random draws, a non-negative integer.
 
   Raises:
-    SpecError: If the learner is unknown, an option is invalid, or the specs
-      lack a register that the learner needs.
+    SpecError: If the learner is unknown, an option is invalid, the specs lack a
+      register that the learner needs, or JAX has no device.
   """
+  jax_settings.check_device()
   num_envs = integers.check('num_envs', num_envs, 1)
   seed = integers.check('seed', seed, 0, high=None)
   options = options_of(spec)

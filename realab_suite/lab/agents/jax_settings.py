@@ -8,9 +8,16 @@ itself keeps its own settings.
 
 from collections.abc import Iterator
 import contextlib
+import os
 from typing import Any
 
 import jax
+
+from realab_suite import errors
+from realab_suite.config import messages
+
+# Environment variables that choose devices.
+_CHOICES = ('JAX_PLATFORMS', 'JAX_PLATFORM_NAME')
 
 # Settings that can change results, but have no public context manager in JAX.
 _RECORDED = (
@@ -38,6 +45,23 @@ def pinned() -> Iterator[None]:
       jax.transfer_guard('allow'),
   ):
     yield
+
+
+def check_device() -> None:
+  """Checks that JAX has a device.
+
+  Raises:
+    SpecError: If it has none; the message names the variables to change.
+  """
+  try:
+    jax.devices()
+  except Exception as error:  # JAX raises several classes.
+    chosen = [f'{n}={os.environ[n]}' for n in _CHOICES if os.environ.get(n)]
+    raise errors.SpecError(
+        f'{" ".join(chosen) or "JAX"}: no such device for learners'
+        f' ({messages.exception(error):.200}); must be cpu, another platform of'
+        ' this machine, or unset'
+    ) from error
 
 
 def recorded() -> dict[str, Any]:

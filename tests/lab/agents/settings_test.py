@@ -13,6 +13,7 @@ import subprocess
 import sys
 from typing import Any
 
+from dm_env import specs
 import jax
 import numpy as np
 import pytest
@@ -111,6 +112,23 @@ def test_settings_that_are_not_pinned_are_recorded():
   }
   # No name has gone out of date.
   assert 'None' not in before.values()
+
+
+@pytest.mark.parametrize('name', ['JAX_PLATFORMS', 'JAX_PLATFORM_NAME'])
+def test_settings_without_a_device_are_named(
+    monkeypatch: pytest.MonkeyPatch, name: str
+):
+  def fail() -> Any:
+    raise AssertionError  # As JAX does without a plugin.
+
+  monkeypatch.setattr(jax, 'devices', fail)
+  monkeypatch.setenv(name, 'cuda')
+  spec = {'kind': 'policy_gradient', 'reward': 'reward'}
+  with pytest.raises(errors.SpecError, match=rf'^{name}=cuda: no such device'):
+    agents.make(spec, {}, specs.Array((), int), num_envs=1, seed=0)
+  monkeypatch.delenv(name)
+  with pytest.raises(errors.SpecError, match=r'^JAX: no such device'):
+    jax_settings.check_device()
 
 
 if __name__ == '__main__':
