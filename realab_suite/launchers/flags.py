@@ -7,9 +7,10 @@ so that a flag without an effect is refused.
 from collections.abc import Mapping
 import functools
 import importlib
+import os
 import re
 import sys
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar, final
 
 from absl import flags
 
@@ -32,6 +33,20 @@ _NUM_EPISODES = 2
 _SHARED = flags.FlagValues()
 _Run = TypeVar('_Run')
 
+
+@final
+class _PathParser(flags.ArgumentParser[str]):
+  """Parser of paths. Shells leave the `~` in `--output=~/folder` as it is."""
+
+  def parse(self, argument: str) -> str:
+    """Returns a path, or several with commas, with home folders in full."""
+    return ','.join(map(os.path.expanduser, argument.split(',')))
+
+
+def _path(name: str, default: str | None, what: str) -> flags.FlagHolder[Any]:
+  return flags.DEFINE(_PathParser(), name, default, what, flag_values=_SHARED)
+
+
 _string = functools.partial(flags.DEFINE_string, flag_values=_SHARED)
 _list = functools.partial(flags.DEFINE_list, flag_values=_SHARED)
 _strings = functools.partial(flags.DEFINE_multi_string, flag_values=_SHARED)
@@ -47,12 +62,12 @@ ACCEPT_OTHER_CODE = flags.DEFINE_boolean(
     ' continues on other code.',
     flag_values=_SHARED,
 )
-INPUT = _string('input', None, 'Folder of a sweep, or of published results.')
-OUTPUT = _string(
+INPUT = _path('input', None, 'Folder of a sweep, or of published results.')
+OUTPUT = _path(
     'output', None, 'Folder to write into; `report` has a default: the input.'
 )
 RUN = _string('run', None, 'Run, such as reward, or reward.secure, its twin.')
-VIDEO = _string(
+VIDEO = _path(
     'video', None, 'New film: an .mp4 file, or a .webp file, which repeats.'
 )
 # Without an upper bound, so that the seed of a served world can be secret.
@@ -86,7 +101,7 @@ TASK_KWARGS = _string(
     '{}',
     'Arguments of the task, such as --task_kwargs="{camera_size: [32, 32]}".',
 )
-DESIGN = _string(
+DESIGN = _path(
     'design',
     'instantaneous_reward',
     'Design: name of one of the package, or path of a YAML file.',
@@ -120,7 +135,7 @@ SEEDS = _string(
 SCRIPTED = (POLICIES, CHANNELS, SEEDS, EPISODES)
 
 # Learners.
-EXPERIMENT = _string(
+EXPERIMENT = _path(
     'experiment', None, 'Name of an experiment of the package, or a YAML file.'
 )
 

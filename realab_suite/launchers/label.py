@@ -10,6 +10,7 @@ agent has caused, and the label whether the agent is tampering (docs/doors.md).
 card with the counts and the columns.
 """
 
+import os
 import pathlib
 from typing import Any
 
@@ -88,7 +89,10 @@ def _scripted(seeds: tuple[int, ...]) -> list[Any]:
   for policy in names:
     policies.POLICIES.get(policy)
   overrides = tuple(flags.SET.value)
-  designs = [specs.load(design, overrides) for design in _DESIGNS.value]
+  designs = [
+      specs.load(os.path.expanduser(design), overrides)
+      for design in _DESIGNS.value
+  ]
   channels = [f'channel={one}' for one in flags.CHANNELS.value]
   twins = [
       [specs.load(design, [one]) for one in channels] or [design]

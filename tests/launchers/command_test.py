@@ -19,6 +19,7 @@ from realab_suite.launchers import compare
 from realab_suite.launchers import explore
 from realab_suite.launchers import film
 from realab_suite.launchers import flags
+from realab_suite.launchers import label
 from realab_suite.launchers import renderers
 from realab_suite.launchers import sweep  # noqa: F401 - defines --workers.
 from realab_suite.launchers import train  # noqa: F401 - defines --parent.
@@ -90,7 +91,8 @@ def test_the_main_job_runs_from_the_command_line(tmp_path):
   ran = _run(
       '--policies=no_op', '--channels=embedded,secure', '--seeds=7,',
       '--episodes=1', '--max_steps=5', '--set=registers.reward.scale=0.2',
-      f'--output={output}',
+      '--output=~/results',
+      HOME=str(tmp_path),
   )  # fmt: skip
   assert ran.returncode == 0, ran.stderr
   assert ran.stderr == ''
@@ -117,6 +119,26 @@ def test_the_main_job_runs_from_the_command_line(tmp_path):
 )
 def test_a_wrong_command_is_refused_in_one_line(arguments, complaint):
   assert complaint in in_process.complaint(compare, *arguments)
+
+
+@pytest.mark.parametrize(
+    'name', ['input', 'output', 'video', 'design', 'experiment']
+)
+def test_home_folders_in_paths_are_expanded(name, monkeypatch):
+  monkeypatch.setenv('HOME', '/home/ada')
+  flag = flags._SHARED[name]
+  before = flag.value
+  try:
+    flag.parse('~/a,b~,~/c')
+    assert flag.value == '/home/ada/a,b~,/home/ada/c'
+  finally:
+    flag.value = before
+
+
+def test_home_folders_in_lists_of_designs_are_expanded(monkeypatch):
+  monkeypatch.setenv('HOME', '/home/ada')
+  said = in_process.complaint(label, '--designs=~/no.yaml', '--output=new')
+  assert "'/home/ada/no.yaml'" in said
 
 
 @pytest.mark.parametrize(
