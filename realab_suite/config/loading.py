@@ -65,7 +65,7 @@ def read_mapping(
   """Returns a checked description that shares nothing with its source.
 
   Args:
-    source: Path of a YAML file, or a mapping of the same shape. Tuples in it
+    source: Path of a YAML file, or a mapping of the same shape. Sequences in it
       become lists, -0.0 becomes 0.0, and subclasses of the plain types (such as
       NumPy's float64) become the plain types.
 
@@ -78,6 +78,21 @@ def read_mapping(
     return dict(_plain(source, '<mapping>'))
   path = os.fsdecode(source)
   return parse_yaml(read_file(path, _MAX_BYTES), path)
+
+
+def is_list(value: Any) -> bool:
+  """Returns whether a value is a list, perhaps of a library like OmegaConf."""
+  is_text = isinstance(value, str | bytes | bytearray)
+  return isinstance(value, Sequence) and not is_text
+
+
+def with_lists(value: Any) -> Any:
+  """Returns a value with the lists and mappings of Python, at any depth."""
+  if isinstance(value, Mapping):
+    return {key: with_lists(item) for key, item in value.items()}
+  if is_list(value) and not isinstance(value, tuple):
+    return [with_lists(item) for item in value]
+  return value
 
 
 def read_file(path: str, max_bytes: int) -> bytes:
@@ -220,7 +235,7 @@ def texts_in(value: Any) -> Iterator[str]:
     for key, item in value.items():
       yield from texts_in(key)
       yield from texts_in(item)
-  elif isinstance(value, list | tuple):
+  elif is_list(value):
     for item in value:
       yield from texts_in(item)
 
@@ -370,7 +385,7 @@ def _plain(value: Any, where: str, path: tuple[str | int, ...] = ()) -> Any:
     SpecError: If the value is not allowed in a description.
   """
   problem = ''
-  if isinstance(value, Mapping | list | tuple):
+  if isinstance(value, Mapping) or is_list(value):
     if len(path) >= _MAX_DEPTH:
       problem = _TOO_DEEP
     elif len(value) > _MAX_ENTRIES:

@@ -179,7 +179,7 @@ def validate(
   Args:
     model_class: Class of the model. Its own configuration determines how strict
       the validation is.
-    data: Result of `loading.read_mapping`.
+    data: Result of `loading.read_mapping`, or a mapping from a program.
     where: Name of the data in error messages.
     overrides: Overrides of the data; see `loading.apply_overrides`. If one of
       them makes valid data invalid, the message names it in place of the data.
@@ -202,6 +202,7 @@ def validate(
       return _problems(error, changed)
     return []
 
+  data = loading.with_lists(data)
   changed = loading.apply_overrides(data, overrides) if overrides else data
   with contextlib.suppress(pydantic.ValidationError):
     return model_class.model_validate(changed, context=free)

@@ -8,6 +8,7 @@ import numpy as np
 
 from realab_suite import errors
 from realab_suite.config import integers
+from realab_suite.config import loading
 from realab_suite.config import messages
 
 MAX_ENVS = 2**16
@@ -104,7 +105,7 @@ def senses(given: Any) -> tuple[str, ...] | None:
   if given is None:
     return None
   if (
-      not isinstance(given, list | tuple)
+      not loading.is_list(given)
       or not all(isinstance(name, str) for name in given)
       or len(set(given)) < len(given)
   ):

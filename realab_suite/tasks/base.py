@@ -13,6 +13,7 @@ from dm_env import specs
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.config import loading
 from realab_suite.entities import appearance
 from realab_suite.entities import arenas
 from realab_suite.entities import avatars
@@ -313,7 +314,7 @@ def _checked_size(camera_size: Any) -> tuple[int, int] | None:
   """
   if camera_size is None:
     return None
-  size = list(camera_size) if isinstance(camera_size, list | tuple) else []
+  size = list(camera_size) if loading.is_list(camera_size) else []
   if len(size) != 2 or not all(type(n) is int and 0 < n <= 4096 for n in size):
     raise errors.SpecError(
         f'camera_size: {camera_size!r:.80}; must be (height, width) in'
