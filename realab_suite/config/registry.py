@@ -15,8 +15,8 @@ from realab_suite import errors
 from realab_suite.config import messages
 
 HOW_TO_REPLACE = (
-    'choose another name, or define it again in the same module, with the same'
-    ' name and not inside a function'
+    'choose another name; a notebook or a reloaded module may define it again,'
+    ' with the same name and not inside a function'
 )
 """What to do about a name that is taken, for messages."""
 
@@ -100,15 +100,13 @@ def is_same(old: Any, new: Any) -> bool:
   their modules and qualified names are. What a function defines, and lambdas,
   may be different things of one name, and are not.
   """
-  origin = _origin(new)
-  return old is new or (origin is not None and origin == _origin(old))
-
-
-def _origin(entry: Any) -> tuple[str, str] | None:
-  """Returns the module and qualified name of an entry, or `None`."""
-  while isinstance(entry, functools.partial):
-    entry = entry.func
-  if not isinstance(entry, type | types.FunctionType):
-    return None
-  name = entry.__qualname__
-  return None if '<' in name else (entry.__module__, name)
+  if isinstance(old, functools.partial) and isinstance(new, functools.partial):
+    return is_same(old.func, new.func)
+  kinds = type | types.FunctionType
+  if old is new or not (isinstance(old, kinds) and isinstance(new, kinds)):
+    return old is new
+  name = new.__qualname__
+  return '<' not in name and (old.__module__, old.__qualname__) == (
+      new.__module__,
+      name,
+  )
