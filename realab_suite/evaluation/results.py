@@ -1,6 +1,7 @@
 """Results of episodes, and files with one of them per line, as JSON."""
 
 from collections.abc import Iterator
+import functools
 from importlib import metadata
 import os
 import pathlib
@@ -220,10 +221,20 @@ def versions() -> dict[str, str]:
       'code': sources.digest(),
       'python': platform.python_version(),
       **{
-          name: metadata.version(name)
+          name: version_of(name)
           for name in ('dm-control', 'mujoco', 'numpy')
       },
   }
+
+
+@functools.cache
+def version_of(package: str) -> str:
+  """Returns the version of a package, which is read from a file once.
+
+  Raises:
+    PackageNotFoundError: If it is not installed.
+  """
+  return metadata.version(package)
 
 
 def versions_of_rows() -> dict[str, str]:

@@ -49,6 +49,9 @@ _ENGINE = absl_flags.DEFINE_enum(
     ' system (needs the extra `cluster`).',
 )
 
+# Number of jobs that take a while to begin.
+_MANY = 10
+
 
 def main() -> None:
   """Runs the sweep that the flags describe."""
@@ -78,7 +81,12 @@ def main() -> None:
       for job in planned
       if not (folder / job.folder() / storage.DONE).exists()
   ]
-  training.rehearse(unfinished, name)
+  if len(unfinished) > _MANY:
+    program.say(
+        f'{len(unfinished)} of {len(planned)} jobs are not finished; checking'
+        ' their learners'
+    )
+  training.rehearse(unfinished, name, program.say)
   engine = engines.ENGINES[_ENGINE.value](
       _WORKERS.value or arguments.processors()
   )

@@ -353,5 +353,5 @@ def versions_of_learners() -> dict[str, str]:
   versions = {}
   for name in _LEARNER_PACKAGES:
     with contextlib.suppress(metadata.PackageNotFoundError):
-      versions[name] = metadata.version(name)
+      versions[name] = results.version_of(name)
   return versions

@@ -181,7 +181,11 @@ def check_learners(planned: Iterable[jobs.Job], experiment: str) -> None:
     check_learner(job.design, place)
 
 
-def rehearse(planned: Iterable[jobs.Job], experiment: str) -> None:
+def rehearse(
+    planned: Iterable[jobs.Job],
+    experiment: str,
+    say: Say = lambda line: None,
+) -> None:
   """Makes the learner of each run once, before any job starts.
 
   So a trusted policy of other actions is refused at once, and not hours later,
@@ -191,6 +195,7 @@ def rehearse(planned: Iterable[jobs.Job], experiment: str) -> None:
   Args:
     planned: The jobs.
     experiment: Name or path of their experiment, for messages.
+    say: Called with a line on the progress, after every ten learners.
 
   Raises:
     SpecError: As `check_learner` does, or if a learner does not fit its worlds.
@@ -199,7 +204,9 @@ def rehearse(planned: Iterable[jobs.Job], experiment: str) -> None:
   check_learners(learners.values(), experiment)
   if requirements.missing('jax', 'equinox', 'optax', extra='agents'):
     return
-  for place, job in learners.items():
+  for number, (place, job) in enumerate(learners.items()):
+    if number and not number % 10:
+      say(f'{number} of {len(learners)} learners are checked')
     if job.data is None:
       with _naming(place), contextlib.closing(
           job.experiment.training_world.load_batch(

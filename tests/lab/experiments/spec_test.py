@@ -218,6 +218,21 @@ def test_every_setting_that_affects_results_changes_the_folder(monkeypatch):
   assert folder({}) not in folders
 
 
+def test_a_thousand_jobs_read_the_version_of_a_package_once(monkeypatch):
+  read, version = [], jobs.metadata.version
+  monkeypatch.setattr(
+      jobs.metadata, 'version', lambda name: read.append(name) or version(name)
+  )
+  jobs.results.version_of.cache_clear()
+  experiment = experiment_specs.load(_SMALL)
+  planned = jobs.plan(experiment, range(1000))
+  assert len({job.folder() for job in planned}) == len(planned) >= 1000
+  assert 'mujoco' in read
+  installed = [name for name in read if name in jobs.versions_of_learners()]
+  assert len(installed) == len({*installed})
+  assert read.count('mujoco') == 1
+
+
 def test_each_run_has_its_task_and_the_solver_of_it():
   runs = {
       'here': {'design': 'instantaneous_reward'},

@@ -312,3 +312,14 @@ def test_a_wrong_command_is_refused_in_one_line(tmp_path, monkeypatch):
   ):
     assert problem in in_process.complaint(module, *arguments)
   assert not list(tmp_path.iterdir())
+
+
+def test_a_large_sweep_says_at_once_what_it_will_do(tmp_path, monkeypatch):
+  monkeypatch.chdir(tmp_path)
+  learner = {'kind': 'policy_gradient', 'reward': 'reward', 'gama': 0.9}
+  runs = {'own': {**_SMALL['runs']['good'], 'learner': learner}}
+  large = {**_SMALL, 'runs': runs, 'seeds': [*range(20, 31)]}
+  (tmp_path / 'large.yaml').write_text(json.dumps(large))
+  ended = in_process.run(sweep, '--experiment=large.yaml', '--output=new')
+  assert ended.stdout.startswith('11 of 11 jobs are not finished; checking')
+  assert "unknown key 'gama'" in ended.stderr

@@ -1,6 +1,7 @@
 """Tests of runs: results, resuming after a kill, and errors."""
 
 import contextlib
+import dataclasses
 import errno
 import functools
 import json
@@ -273,6 +274,19 @@ def test_a_run_may_be_killed_whenever_it_replaces_a_file(
         _run(job, tmp_path)
   assert num_starts > 3
   assert _results(path) == _results(whole)
+
+
+def test_a_rehearsal_of_many_learners_says_how_far_it_is():
+  said = []
+  # Those that learn from data are not made.
+  planned = [
+      dataclasses.replace(_job(), run=f'run_{i}', data=('folder', 'digest'))
+      for i in range(21)
+  ]
+  with pytest.MonkeyPatch.context() as patch:
+    patch.setattr(training, 'check_learner', lambda *unused: None)
+    training.rehearse(planned, 'many', said.append)
+  assert said == [f'{n} of 21 learners are checked' for n in (10, 20)]
 
 
 def test_every_machine_of_a_run_is_recorded_once(tmp_path, monkeypatch):
