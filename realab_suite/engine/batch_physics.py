@@ -102,6 +102,15 @@ class BatchPhysics:
     self._stage = _POSITIONS
     self._worlds: dict[int, _WorldView] = {}
 
+  def free(self) -> None:
+    """Frees the worlds, which must not be used afterwards.
+
+    Bindings and worlds refer to this object, so it would otherwise wait for
+    Python's garbage collection.
+    """
+    self._bindings.clear()
+    self._worlds.clear()
+
   @functools.cached_property
   def _poses(self) -> mujoco_batch.Batch:
     """Another batch: it computes poses and casts rays in a copy of the state.

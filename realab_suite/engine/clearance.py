@@ -168,10 +168,12 @@ def survey(
         mujoco.mjtState.mjSTATE_INTEGRATION,
     )
     worlds.state[1:] = worlds.state[0]
-  for name, register in named.items():
-    spread = register.spread.tolist() if is_spread else (0.0, 0.0)
-    starts[name] = start(physics, register, spread)
-    paths[name] = _shapes(physics, register, spread, *_along(worlds, register))
+    for name, register in named.items():
+      spread = register.spread.tolist() if is_spread else (0.0, 0.0)
+      starts[name] = start(physics, register, spread)
+      along = _along(worlds, register)
+      paths[name] = _shapes(physics, register, spread, *along)
+    worlds.free()
   everything = np.ones_like(space.is_fixed)
   return Survey(
       space,

@@ -79,17 +79,7 @@ class Environment(composer.Environment):
         random_state=seeding.random_state(seed, world, 0, 'construction'),
         recompile_mjcf_every_episode=host.IS_RECOMPILED,
     )
-    host.start(
-        mechanism,
-        self._hooks,
-        self._random_state,
-        lambda: self._observation_updater,
-    )
-    self._observer = observing.Observer(host, mechanism, max_steps, senses)
-    self._schedule = mechanism.design.schedule_for(self._n_sub_steps)
-    self._codec = action_codec.for_design(
-        task.action_spec(self._physics_proxy), mechanism
-    )
+    self._fit_to_world()
     self._seed, self._world, self._episode = seed, world, -1
     # True after the sinks were notified of the start of an episode, until they
     # are notified of its end.
@@ -491,10 +481,34 @@ class Environment(composer.Environment):
     if self._recompile_mjcf_every_episode:
       self._hooks.initialize_episode_mjcf(self._random_state)
       self._recompile_physics_and_update_observables()
+      self._fit_to_world()
     with self._host.initializing(self._physics, self._mechanism):
       self._hooks.initialize_episode(self._physics_proxy, self._random_state)
     self.check_start(self._physics)
     self._host.begin_observing(self._physics_proxy)
+
+  def _fit_to_world(self) -> None:
+    """Makes what depends on the compiled world.
+
+    A foreign task may change its timesteps, actions and observables for each
+    episode.
+
+    Raises:
+      SpecError: If the design or the selected senses do not fit the world.
+    """
+    self._host.start(
+        self._mechanism,
+        self._hooks,
+        self._random_state,
+        lambda: self._observation_updater,
+    )
+    self._observer = observing.Observer(
+        self._host, self._mechanism, self._max_steps, self._selected_senses
+    )
+    self._schedule = self._mechanism.design.schedule_for(self._n_sub_steps)
+    self._codec = action_codec.for_design(
+        self._task.action_spec(self._physics_proxy), self._mechanism
+    )
 
   def _make_observation_updater(self) -> Any:
     own_senses = self._mechanism.own_senses

@@ -78,9 +78,8 @@ def unchanged(physics: mjcf.Physics) -> Iterator[None]:
 class ForeignHost(hosts.Host):
   """Host of a foreign task.
 
-  The senses that the task offers are the observables that were enabled when it
-  was embedded, except those of meters and providers. Observables that are
-  enabled later are not observed.
+  The senses that the task offers are the observables that are enabled when an
+  episode begins, except those of meters and providers.
   """
 
   PHYSICS = ForeignPhysics
@@ -173,6 +172,7 @@ class ForeignHost(hosts.Host):
         next attempt generates another world.
     """
     model = physics.model
+    self._view = None  # It would keep the previous world alive.
     with physics.reset_context():
       geoms = list(clearance.owners(physics, mechanism.registers))
       # Rays pass through geoms without opacity.
@@ -242,7 +242,7 @@ class ForeignHost(hosts.Host):
   def view(self, physics: Any) -> Any:
     if not self._has_registers:
       return physics
-    if self._view is None or self._view.data is not physics.data:
+    if self._view is None:
       self._view = views.View(physics)
     return self._view
 

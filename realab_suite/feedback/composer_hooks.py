@@ -12,6 +12,7 @@ step, and before that lets the meters by themselves measure.
 """
 
 import abc
+from collections.abc import Callable
 from collections.abc import Sequence
 from typing import Any, final
 
@@ -20,6 +21,7 @@ from dm_control import mjcf
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.config import integers
 from realab_suite.entities import meters
 from realab_suite.entities import state
 from realab_suite.entities import views
@@ -117,20 +119,25 @@ class _Hooks(composer.Entity, abc.ABC):
 class ComposerHooks(_Hooks):
   """Runs the phases of a mechanism from Composer's hooks."""
 
-  def _build(self, mechanism: Any, num_substeps: int | None) -> None:
+  def _build(
+      self, mechanism: Any, num_substeps: int | Callable[[], int] | None
+  ) -> None:
     """Makes the hooks of a mechanism.
 
     Args:
       mechanism: The `FeedbackMechanism`.
-      num_substeps: Number of substeps in a control step, if it is known.
+      num_substeps: Number of substeps in a control step, if it is known, or a
+        function that returns it for the world that was compiled last.
     """
     title = f'design {mechanism.design.name!r}'
     self._start(mechanism, title, mechanism.phases)
     self._mechanism = mechanism
-    self._num_substeps = num_substeps
     self._schedule: specs.ScheduleSpec | None = None
-    if num_substeps is not None or mechanism.design.schedule is not None:
-      self._schedule = mechanism.design.schedule_for(num_substeps or _MANY)
+    self._count_substeps: Callable[[], int] | None = None
+    if callable(num_substeps):
+      self._count_substeps = num_substeps
+    else:
+      self._fit_schedule(num_substeps)
     self._is_connected = False
     self._view: Any = None
     # Substeps of the current control step so far.
@@ -146,6 +153,9 @@ class ComposerHooks(_Hooks):
         does not fit the world.
     """
     del random_state
+    if self._count_substeps is not None:
+      number = integers.check('num_substeps', self._count_substeps(), 1)
+      self._fit_schedule(number)
     if not self._is_connected:
       self._connect()
       self._is_connected = True
@@ -195,16 +205,29 @@ class ComposerHooks(_Hooks):
         not failed.
     """
     del random_state
+    # MuJoCo's counts of warnings show a failure, which ends a step early.
+    if not physics.data.ptr.warning.number.any():
+      self._check_substeps()
+    self._phases.end_step(physics, 0.0)
+
+  def _fit_schedule(self, num_substeps: int | None) -> None:
+    """Fits the schedule to a number of substeps, if it is known."""
+    self._num_substeps = num_substeps
+    design = self._mechanism.design
+    if num_substeps is not None or design.schedule is not None:
+      self._schedule = design.schedule_for(num_substeps or _MANY)
+
+  def _check_substeps(self) -> None:
+    """Raises a SpecError if the schedule does not fit the control step."""
     done, expected = self._num_done, self._num_substeps
     if expected is None:
-      expected = max(done, self._substeps[1] + 1)
-    # MuJoCo's counts of warnings show a failure, which ends a step early.
-    if done != expected and not physics.data.ptr.warning.number.any():
+      self._mechanism.design.schedule_for(done)
+    elif done != expected:
       raise errors.SpecError(
           f'num_substeps: {expected}; must be {done}, as in a control step'
-          ' of this environment'
+          ' of this environment; if the task changes it between episodes, pass'
+          ' num_substeps=lambda: task.physics_steps_per_control_step'
       )
-    self._phases.end_step(physics, 0.0)
 
   @property
   def _substeps(self) -> tuple[int, int]:
@@ -219,7 +242,7 @@ class ComposerHooks(_Hooks):
     return self._schedule.meter_substep, self._schedule.provider_substep
 
   def _connect(self) -> None:
-    """Connects the meters and enables the readings as observables.
+    """Connects the meters.
 
     Raises:
       SpecError: If the design needs what entities of Composer do not get.
@@ -242,7 +265,6 @@ class ComposerHooks(_Hooks):
       )
     if not mechanism.is_connected:
       mechanism.connect({})
-    mechanism.observables.enable_all()
 
 
 @final

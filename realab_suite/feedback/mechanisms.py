@@ -3,7 +3,7 @@
 `phases` has the parts of a control step in which it acts.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 import itertools
 from typing import final
 
@@ -52,7 +52,9 @@ class FeedbackMechanism(modelled.ModelledEntity):
   """
 
   def _build(
-      self, design: specs.DesignSpec, num_substeps: int | None = None
+      self,
+      design: specs.DesignSpec,
+      num_substeps: int | Callable[[], int] | None = None,
   ) -> None:
     """Builds the registers of a design.
 
@@ -60,7 +62,8 @@ class FeedbackMechanism(modelled.ModelledEntity):
       design: The design; see `specs.load`.
       num_substeps: Number of physics substeps in a control step of the task.
         Composer does not pass it to entities, so an environment of Composer
-        needs it for designs without a `schedule`.
+        needs it for designs without a `schedule`. A function that returns it,
+        if it differs between episodes.
 
     Raises:
       SpecError: If `design` is no `DesignSpec`, if `num_substeps` is not a
@@ -71,7 +74,7 @@ class FeedbackMechanism(modelled.ModelledEntity):
           f'design: {messages.quote(design)}; must be a DesignSpec, as from'
           ' specs.load(name_or_file_or_dict)'
       )
-    if num_substeps is not None:
+    if num_substeps is not None and not callable(num_substeps):
       num_substeps = integers.check('num_substeps', num_substeps, 1)
     self._design = design
     self._mjcf_root = mjcf.RootElement(model='feedback')
@@ -120,13 +123,13 @@ class FeedbackMechanism(modelled.ModelledEntity):
   def _build_observables(self) -> composer.Observables:
     """Returns the readings of registers that agents read, by port.
 
-    They are enabled where Composer's hooks run the mechanism, and disabled
-    where an environment of this package makes the observations.
+    They are enabled until `leave_phases`, because an environment of this
+    package makes the observations itself.
     """
     observables = super()._build_observables()
     for name in self._read_by_agent:
       reading = observable.Generic(self._ports[name].read)
-      observables.add_observable(name, reading, enabled=False)
+      observables.add_observable(name, reading, enabled=True)
     return observables
 
   def iter_entities(
@@ -144,6 +147,7 @@ class FeedbackMechanism(modelled.ModelledEntity):
   def leave_phases(self) -> None:
     """Leaves the phases of control steps to the caller."""
     self._hooks = None
+    self.observables.disable_all()
 
   @property
   def phases(self) -> phases.Phases:

@@ -1,4 +1,4 @@
-"""Tasks of dm_control that tests and a campaign embed."""
+"""Tasks that tests and a campaign embed, and what Composer makes of them."""
 
 from collections.abc import Callable
 import functools
@@ -12,9 +12,20 @@ from dm_control.locomotion import props
 from dm_control.locomotion import tasks
 from dm_control.locomotion import walkers
 from dm_control.manipulation.shared import registry
+import dm_env
+import mujoco
 import numpy as np
 
+from realab_suite import suite
+from realab_suite.engine import events
+from realab_suite.engine import seeding
+from realab_suite.evaluation import ledgers
 from tests.engine import helpers
+
+_SEED = 11
+_STATE = int(mujoco.mjtState.mjSTATE_FULLPHYSICS) | int(
+    mujoco.mjtState.mjSTATE_WARMSTART
+)
 
 
 def lucky(call: Callable[[], Any], seed: int = 5) -> Any:
@@ -159,3 +170,72 @@ def without_cameras(task: composer.Task) -> composer.Task:
 def make_composer(name: str) -> composer.Task:
   """Returns a new task of `COMPOSER_TASKS`, without cameras."""
   return without_cameras(lucky(COMPOSER_TASKS[name]))
+
+
+def _bytes(time_step: dm_env.TimeStep, reward: Any) -> list[Any]:
+  """Returns all of a time step, with its reward, canonically."""
+  discount = time_step.discount
+  return [
+      int(time_step.step_type),
+      None if reward is None else np.float64(reward).tobytes(),
+      None if discount is None else np.float64(discount).tobytes(),
+      {
+          key.removeprefix('senses/'): (
+              np.asarray(value).dtype.str,
+              np.shape(value),
+              np.asarray(value).tobytes(),
+          )
+          for key, value in time_step.observation.items()
+      },
+  ]
+
+
+def _state(physics: Any, num_own: int) -> list[bytes]:
+  """Returns the state of a world, with a number of its own userdata."""
+  state = np.empty(mujoco.mj_stateSize(physics.model.ptr, _STATE))
+  mujoco.mj_getState(physics.model.ptr, physics.data.ptr, state, _STATE)
+  return [state.tobytes(), physics.data.userdata[:num_own].tobytes()]
+
+
+def assert_identical(
+    make: Callable[[], composer.Task], num_steps: int, num_episodes: int = 2
+) -> list[int]:
+  """Plays a task both ways; returns the step types that came up."""
+  random_state = seeding.random_state(_SEED, 0, 0, 'construction')
+  stock = composer.Environment(
+      make(), random_state=random_state, strip_singleton_obs_buffer_dim=True
+  )
+  env = suite.embed(make(), 'none', random=_SEED, max_steps=None)
+  ledger = ledgers.Ledger()
+  env.add_sink(ledger)
+  generator = np.random.default_rng(0)
+  seen = []
+  for episode in range(num_episodes):
+    seeding.reseed(random_state, _SEED, 0, episode, 'reset/0')
+    expected, time_step = lucky(stock.reset), lucky(env.reset)
+    assert _bytes(time_step, None) == _bytes(expected, None)
+    expected_spec = stock.observation_spec()
+    assert env.observation_spec() == {
+        f'senses/{key}': value.replace(name=f'senses/{key}')
+        for key, value in expected_spec.items()
+    }
+    spec = stock.action_spec()
+    assert env.action_spec() == spec
+    low, high = np.maximum(spec.minimum, -1), np.minimum(spec.maximum, 1)
+    for _ in range(num_steps):
+      action = generator.uniform(low, high).astype(spec.dtype)
+      expected, time_step = (
+          lucky(functools.partial(one.step, action)) for one in (stock, env)
+      )
+      reward = ledger.last.true_rewards[-1]
+      assert _bytes(time_step, reward) == _bytes(expected, expected.reward)
+      assert time_step.reward == 0.0
+      num_own = stock.physics.model.nuserdata
+      assert _state(env.physics, num_own) == _state(stock.physics, num_own)
+      seen.append(int(time_step.step_type))
+      if time_step.last():
+        break
+    assert time_step.last() == (ledger.last.end is events.End.TERMINATED)
+  stock.close()
+  env.close()
+  return seen

@@ -1,18 +1,14 @@
 """An embedded task of dm_control gives what `composer.Environment` gives."""
 
-from collections.abc import Callable
 import functools
 from typing import Any
 
-from dm_control import composer
-import dm_env
 import numpy as np
 import pytest
 
 from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import events
-from realab_suite.engine import seeding
 from realab_suite.evaluation import ledgers
 from realab_suite.tasks import registry
 from tests import examples
@@ -30,75 +26,12 @@ _REGISTER = {
 }
 
 
-def _composer(task: composer.Task) -> tuple[composer.Environment, Any]:
-  random_state = seeding.random_state(_SEED, 0, 0, 'construction')
-  stock = composer.Environment(
-      task, random_state=random_state, strip_singleton_obs_buffer_dim=True
-  )
-  return stock, random_state
-
-
-def _bytes(time_step: dm_env.TimeStep, reward: Any) -> list[Any]:
-  """Returns all of a time step, with its reward, canonically."""
-  discount = time_step.discount
-  return [
-      int(time_step.step_type),
-      None if reward is None else np.float64(reward).tobytes(),
-      None if discount is None else np.float64(discount).tobytes(),
-      {
-          key.removeprefix('senses/'): (
-              np.asarray(value).dtype.str,
-              np.shape(value),
-              np.asarray(value).tobytes(),
-          )
-          for key, value in time_step.observation.items()
-      },
-  ]
-
-
-def _assert_identical(
-    make: Callable[[], composer.Task], num_steps: int, num_episodes: int = 2
-) -> list[int]:
-  """Plays a task both ways; returns the step types that came up."""
-  stock, random_state = _composer(make())
-  env = suite.embed(make(), 'none', random=_SEED, max_steps=None)
-  ledger = ledgers.Ledger()
-  env.add_sink(ledger)
-  expected_spec = stock.observation_spec()
-  found_spec = env.observation_spec()
-  assert set(found_spec) == {f'senses/{key}' for key in expected_spec}
-  generator = np.random.default_rng(0)
-  spec = stock.action_spec()
-  low, high = np.maximum(spec.minimum, -1), np.minimum(spec.maximum, 1)
-  seen = []
-  for episode in range(num_episodes):
-    seeding.reseed(random_state, _SEED, 0, episode, 'reset/0')
-    expected, time_step = embedded.lucky(stock.reset), embedded.lucky(env.reset)
-    assert _bytes(time_step, None) == _bytes(expected, None)
-    for _ in range(num_steps):
-      action = generator.uniform(low, high).astype(spec.dtype)
-      expected, time_step = (
-          embedded.lucky(functools.partial(one.step, action))
-          for one in (stock, env)
-      )
-      reward = ledger.last.true_rewards[-1]
-      assert _bytes(time_step, reward) == _bytes(expected, expected.reward)
-      assert time_step.reward == 0.0
-      seen.append(int(time_step.step_type))
-      if time_step.last():
-        break
-    assert time_step.last() == (ledger.last.end is events.End.TERMINATED)
-  stock.close()
-  env.close()
-  return seen
-
-
 # Half of them, with walkers and arms of each kind; in the profile `long`, all.
 @pytest.mark.parametrize(
     'name', [*embedded.COMPOSER_TASKS][:: 1 if examples.IS_LONG else 2]
 )
 def test_an_embedded_task_equals_composer_bit_for_bit(name: str):
-  assert _assert_identical(
+  assert embedded.assert_identical(
       functools.partial(embedded.make_composer, name), num_steps=8
   )
 
@@ -107,7 +40,7 @@ def test_an_embedded_task_equals_composer_bit_for_bit(name: str):
     'name', ['humanoid in a corridor', 'single goal maze that ends at once']
 )
 def test_episodes_that_the_task_ends_end_as_in_composer(name: str):
-  seen = _assert_identical(
+  seen = embedded.assert_identical(
       functools.partial(embedded.make_composer, name), num_steps=400
   )
   assert 2 in seen

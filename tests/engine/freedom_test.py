@@ -1,0 +1,291 @@
+"""Composer tasks that use their freedom are as free in this engine."""
+
+from collections.abc import Callable
+import gc
+import itertools
+from typing import Any
+import weakref
+
+from dm_control import composer
+from dm_control.composer.variation import distributions
+from dm_control.composer.variation import noises
+from dm_control.entities import props
+import mujoco
+import numpy as np
+import pytest
+
+from realab_suite import errors
+from realab_suite import suite
+from realab_suite.feedback import mechanisms
+from realab_suite.feedback import specs
+from tests.engine import embedded
+from tests.engine import helpers
+
+
+class _Free(helpers.PointTask):
+  """Changes something before each episode."""
+
+  def __init__(
+      self,
+      change: Callable[[Any, int, Any], None],
+      look: Callable[[Any, Any], Any],
+  ) -> None:
+    super().__init__()
+    self.num_episodes = 0
+    # What the change made of the world at the start of each episode.
+    self.looks: list[Any] = []
+    self.props: list[composer.Entity] = []
+    self._change, self._look = change, look
+
+  def initialize_episode_mjcf(self, random_state: Any) -> None:
+    self._change(self, self.num_episodes, random_state)
+    self.num_episodes += 1
+
+  def initialize_episode(self, physics: Any, random_state: Any) -> None:
+    super().initialize_episode(physics, random_state)
+    self.looks.append(self._look(self, physics))
+
+  def should_terminate_episode(self, physics: Any) -> bool:
+    return bool(physics.time() > 0.6)
+
+  def get_discount(self, physics: Any) -> float:
+    return 0.9
+
+
+def _option(name: str, values: list[Any]) -> Any:
+  def change(task: _Free, episode: int, random_state: Any) -> None:
+    setattr(task.root_entity.mjcf_model.option, name, values[episode])
+
+  return (
+      change,
+      lambda task, physics: np.array(getattr(physics.model.opt, name)).tolist(),
+  )
+
+
+def _timesteps(*steps: tuple[float, float]) -> Any:
+  return (
+      lambda task, episode, random_state: task.set_timesteps(*steps[episode]),
+      lambda task, physics: task.physics_steps_per_control_step,
+  )
+
+
+def _set_physics_timestep(task: _Free, episode: int, random_state: Any) -> None:
+  task.physics_timestep = [0.025, 0.05, 0.01][episode]
+
+
+def _set_control_timestep(task: _Free, episode: int, random_state: Any) -> None:
+  task.control_timestep = [0.03, 0.01, 0.07][episode]
+
+
+def _change_props(task: _Free, episode: int, random_state: Any) -> None:
+  for prop in task.props:
+    prop.detach()
+  task.props = [
+      props.Primitive(
+          geom_type='box', size=[0.05] * 3, name=f'box_{i}',
+          pos=[random_state.uniform(0.2, 0.3), 0, 1],
+      )
+      for i in range(episode)
+  ]  # fmt: skip
+  for prop in task.props:
+    task.root_entity.add_free_entity(prop)
+    prop.observables.position.enabled = True
+
+
+def _find_props(task: _Free, physics: Any) -> list[int]:
+  return [
+      len(task.props),
+      sum(physics.model.geom_type == mujoco.mjtGeom.mjGEOM_BOX),
+  ]
+
+
+def _set_friction(task: _Free, episode: int, random_state: Any) -> None:
+  task.joint.frictionloss = random_state.uniform(0.0, 0.5)
+  task.joint.damping = episode
+
+
+def _add_motor(task: _Free, episode: int, random_state: Any) -> None:
+  task.root_entity.mjcf_model.actuator.add(
+      'motor', joint=task.joint, ctrllimited=True, ctrlrange=(-0.5, 0.5)
+  )
+
+
+def _set_delays(task: _Free, episode: int, random_state: Any) -> None:
+  task.bead.configure(
+      delay=[2, distributions.UniformInteger(0, 7), None][episode],
+      buffer_size=[None, 3, 4][episode],
+      update_interval=[3, None, distributions.UniformInteger(1, 4)][episode],
+      corruptor=noises.Additive(distributions.Normal(scale=0.1)),
+      aggregator=[None, 'max', lambda values: values.sum(axis=0)][episode],
+  )
+  task.secret.configure(enabled=episode == 1)
+
+
+def _write_in_substeps(task: _Free, episode: int, random_state: Any) -> None:
+  def write(physics: Any, random_state: Any) -> None:
+    physics.model.opt.gravity[0] = random_state.uniform(-1, 1)
+    physics.bind(task.joint).damping = random_state.uniform()
+
+  task.begin = task.end_step = write
+
+
+_FREEDOMS: dict[str, Any] = {
+    'timesteps': _timesteps((0.02, 0.005), (0.02, 0.001), (0.1, 0.01)),
+    'one substep': _timesteps((0.05, 0.01), (0.03, 0.03), (0.02, 0.01)),
+    'physics timestep': (_set_physics_timestep, _timesteps()[1]),
+    'control timestep': (_set_control_timestep, _timesteps()[1]),
+    'gravity': _option('gravity', [[1, 0, 0], [0, 0, -9.81], [-3, 0, 1]]),
+    'integrator': _option('integrator', ['Euler', 'RK4', 'implicit']),
+    'solver': _option('solver', ['PGS', 'Newton', 'CG']),
+    'wind': _option('wind', [[1, 0, 0], [0, 0, 0], [-9, 0, 0]]),
+    'friction': (
+        _set_friction,
+        lambda task, physics: float(physics.bind(task.joint).damping[0]),
+    ),
+    'props': (_change_props, _find_props),
+    'motors': (_add_motor, lambda task, physics: physics.model.nu),
+    'delays': (_set_delays, lambda task, physics: task.bead.update_interval),
+    'the model in an episode': (
+        _write_in_substeps,
+        lambda task, physics: float(physics.bind(task.joint).damping[0]),
+    ),
+}
+
+
+@pytest.mark.parametrize('name', _FREEDOMS)
+def test_a_free_task_equals_composer_bit_for_bit(name: str):
+  made = []
+
+  def make() -> composer.Task:
+    made.append(_Free(*_FREEDOMS[name]))
+    return made[-1]
+
+  seen = embedded.assert_identical(make, num_steps=50, num_episodes=3)
+  assert {1, 2} == {*seen}
+  stock, ours = (task.looks for task in made)
+  assert stock == ours
+  assert all(a != b for a, b in itertools.pairwise(stock))
+
+
+# Registers beside a task that changes its timesteps.
+
+_FIXED = {'meter_substep': 2, 'provider_substep': 4}
+_REFUSAL = 'schedule.provider_substep: 4 must be less than the 4 substeps'
+
+
+def _slower() -> _Free:
+  return _Free(*_timesteps((0.02, 0.001), (0.02, 0.005), (0.02, 0.02)))
+
+
+def test_the_schedule_follows_the_substeps_of_each_episode():
+  env, sink = helpers.embed(_slower(), helpers.SCORED, max_steps=10)
+  schedules = []
+  for _ in range(3):
+    env.reset()
+    while not env.step(np.zeros(1)).last():
+      pass
+    np.testing.assert_allclose(env.physics.time(), 0.2)
+    schedule = env.schedule
+    schedules.append((schedule.meter_substep, schedule.provider_substep))
+  assert schedules == [(6, 13), (1, 2), (0, 0)]
+  assert len(sink.requested('score')) == 30
+
+
+def test_a_schedule_that_no_longer_fits_is_refused():
+  design = {**helpers.SCORED, 'schedule': _FIXED}
+  env, _ = helpers.embed(_slower(), design)
+  env.reset()
+  with pytest.raises(errors.SpecError, match=_REFUSAL):
+    env.reset()
+
+
+def _attached(num_substeps: Any, **others: Any) -> Any:
+  """Returns Composer's environment of a task that changes its timesteps."""
+  task = _slower()
+  count = num_substeps and (lambda: task.physics_steps_per_control_step)
+  mechanism = mechanisms.FeedbackMechanism(
+      specs.load({**helpers.SCORED, **others}),
+      num_substeps if isinstance(num_substeps, int) else count,
+  )
+  task.root_entity.attach(mechanism)
+  mechanism.connect({'score': lambda physics: physics.time()})
+  return composer.Environment(task), mechanism
+
+
+def test_the_schedule_in_composer_follows_a_function():
+  env, mechanism = _attached('counted')
+  for written in (0.006, 0.005, 0.0):
+    env.reset()
+    env.step(np.zeros(1))
+    applied = mechanism.registers['score'].applied(env.physics)
+    np.testing.assert_allclose(applied, written)
+
+
+@pytest.mark.parametrize(
+    ('num_substeps', 'schedule', 'message'),
+    [
+        (20, None, 'num_substeps: 20; must be 4, .* pass num_substeps=lambda'),
+        (None, _FIXED, _REFUSAL),
+        ('counted', _FIXED, _REFUSAL),
+    ],
+)
+def test_a_schedule_that_does_not_fit_is_refused_in_composer(
+    num_substeps: Any, schedule: Any, message: str
+):
+  env, _ = _attached(num_substeps, schedule=schedule)
+  env.reset()
+  env.step(np.zeros(1))
+  with pytest.raises(errors.SpecError, match=message):
+    _ = env.reset(), env.step(np.zeros(1))
+
+
+# Observables and memory.
+
+
+@pytest.mark.parametrize('is_early', [True, False])
+def test_a_reading_that_is_disabled_stays_disabled(is_early: bool):
+  task = helpers.PointTask()
+  design = {**helpers.SCORED, 'schedule': 'cfmdp'}
+  mechanism = mechanisms.FeedbackMechanism(specs.load(design))
+  task.root_entity.attach(mechanism)
+  mechanism.connect({'score': lambda physics: 0.0})
+  reading = mechanism.observables.get_observable('reward')
+  if is_early:
+    reading.enabled = False
+  env = composer.Environment(task)
+  assert ('feedback/reward' in env.reset().observation) != is_early
+  reading.enabled = False
+  for _ in range(2):
+    assert [*env.reset().observation] == ['bead']
+
+
+def test_senses_follow_the_observables_of_an_episode():
+  task = helpers.PointTask()
+  env = suite.embed(task, 'none', random=1, max_steps=None)
+  task.bead.enabled, task.secret.enabled = False, True
+  assert [*env.reset().observation] == ['senses/secret']
+  env = suite.embed(
+      helpers.PointTask(), 'none', random=1, max_steps=None, senses=['bead']
+  )
+  env.task.bead.enabled = False
+  with pytest.raises(errors.SpecError, match=r"senses: unknown .'bead'."):
+    env.reset()
+
+
+@pytest.mark.parametrize('num_steps', [0, 3])
+def test_the_world_of_an_episode_is_freed_with_the_next_one(num_steps: int):
+  env, _ = helpers.embed(helpers.PointTask(), helpers.SCORED)
+  gc.disable()
+  try:
+    worlds = []
+    for _ in range(3):
+      env.reset()
+      for _ in range(num_steps):
+        env.step(np.zeros(1))
+      parts = env._physics, env._physics.model, env._physics.data
+      worlds.append([weakref.ref(part) for part in parts])
+      del parts
+    alive = [[part() is not None for part in world] for world in worlds]
+  finally:
+    gc.enable()
+  assert alive == [[False] * 3, [False] * 3, [True] * 3]
