@@ -10,12 +10,14 @@ import numpy as np
 
 from realab_suite.engine import single_physics
 from realab_suite.entities import block_kinds
+from realab_suite.entities import state
 
 
 def compile_world(
     root: composer.Entity, kind: type[mjcf.Physics] = mjcf.Physics
 ) -> mjcf.Physics:
   """Returns the physics of a world: anybody's, or this package's own."""
+  state.make_room(root.mjcf_model)
   return kind.from_mjcf_model(root.mjcf_model)
 
 

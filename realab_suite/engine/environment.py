@@ -74,6 +74,7 @@ class Environment(composer.Environment):
     self._has_extra_hooks = False
     self._host = host = _host_of(task)
     hooks.refuse_uncalled(task)
+    state.manage_room(task.root_entity.mjcf_model)
     super().__init__(
         task,
         random_state=seeding.random_state(seed, world, 0, 'construction'),

@@ -1,9 +1,12 @@
 """Base class for entities with an MJCF model of their own."""
 
 import abc
+from collections.abc import Iterator
 
 from dm_control import composer
 from dm_control import mjcf
+
+from realab_suite.entities import state
 
 
 class ModelledEntity(composer.Entity, abc.ABC):
@@ -14,3 +17,13 @@ class ModelledEntity(composer.Entity, abc.ABC):
   @property
   def mjcf_model(self) -> mjcf.RootElement:
     return self._mjcf_root
+
+  def iter_entities(
+      self, exclude_self: bool = False
+  ) -> Iterator[composer.Entity]:
+    """Yields the entity and those attached to it.
+
+    An environment of Composer calls this method before it compiles a world.
+    """
+    state.offer_room(self.mjcf_model)
+    yield from super().iter_entities(exclude_self)

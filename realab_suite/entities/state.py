@@ -8,6 +8,7 @@ the whole episode, and a batch of worlds can share one entity.
 
 from collections.abc import Iterator, Mapping
 import contextlib
+import itertools
 import types
 from typing import Any, final
 import weakref
@@ -20,8 +21,8 @@ from realab_suite import errors
 from realab_suite.entities import axes
 from realab_suite.entities import protocols
 
-# `nuserdata` of every model with a slot. It is the same for all models because
-# PyMJCF refuses to merge models with different values.
+# Least number of userdata for slots in a model. Models of entities declare
+# none, because PyMJCF refuses to merge models with different `nuserdata`.
 CAPACITY = 256
 _PREFIX = 'userdata.'
 
@@ -30,6 +31,12 @@ _PREFIX = 'userdata.'
 _layouts: weakref.WeakKeyDictionary[Any, dict[str, int]] = (
     weakref.WeakKeyDictionary()
 )
+# `nuserdata` of root models with room: their own, and with room.
+_rooms: weakref.WeakKeyDictionary[Any, tuple[int | None, int]] = (
+    weakref.WeakKeyDictionary()
+)
+# Root models for which an environment makes room when it compiles them.
+_managed: weakref.WeakSet[Any] = weakref.WeakSet()
 
 
 @final
@@ -51,7 +58,6 @@ class Slot:
       name: Name of the slot, unique in `mjcf_model`.
       size: Number of floats, or `None` for a scalar.
     """
-    mjcf_model.size.nuserdata = CAPACITY
     self._numeric = mjcf_model.custom.add(
         'numeric', name=_PREFIX + name, size=size or 1
     )
@@ -151,37 +157,71 @@ class Slots:
 
 
 def make_room(mjcf_model: mjcf.RootElement) -> None:
-  """Increases `nuserdata` of a model if its slots need more than `CAPACITY`.
+  """Makes room for slots, after the userdata that the model has itself.
 
-  Worlds that this package loads do not need this function. For other worlds,
-  such as a plain `composer.Environment`, call it once after all entities are
-  attached, if their slots need more than `CAPACITY` numbers.
+  Environments do not need this function, except those of Composer whose slots
+  need more than `CAPACITY` numbers, or with no entity of this package: call it
+  once after all entities are attached. Call it as well before a model is
+  compiled without an environment.
 
   Args:
-    mjcf_model: Model of the root entity.
+    mjcf_model: Model of an entity in the world.
   """
-  numerics = mjcf_model.find_all('numeric')
+  root = mjcf_model.root_model
+  own = _own_size(root)
+  numerics = root.find_all('numeric')
   needed = sum([int(n.size) for n in numerics if n.name.startswith(_PREFIX)])
-  if needed > CAPACITY:
-    mjcf_model.size.nuserdata = needed
+  if needed:
+    root.size.nuserdata = (own or 0) + max(needed, CAPACITY)
+    _rooms[root] = own, root.size.nuserdata
+
+
+def offer_room(mjcf_model: mjcf.RootElement) -> None:
+  """Makes room if there is none, and if no environment manages the room.
+
+  Args:
+    mjcf_model: Model of an entity in the world.
+  """
+  root = mjcf_model.root_model
+  if root not in _managed and not _has_room(root):
+    make_room(root)
+
+
+def manage_room(mjcf_model: mjcf.RootElement) -> None:
+  """Removes the room for slots, which the caller makes for each compilation.
+
+  Models with any `nuserdata` can then be attached and detached in between.
+
+  Args:
+    mjcf_model: Model of an entity in the world.
+  """
+  root = mjcf_model.root_model
+  root.size.nuserdata = _own_size(root)
+  _rooms.pop(root, None)
+  _managed.add(root)
 
 
 @contextlib.contextmanager
 def room_for_slots(mjcf_model: mjcf.RootElement) -> Iterator[None]:
-  """Calls `make_room` and restores `nuserdata` at the end of the context.
-
-  Entities can be attached after the context, because `nuserdata` then agrees
-  with theirs again.
+  """Calls `make_room`, and `manage_room` at the end of the context.
 
   Args:
     mjcf_model: Model of the root entity.
   """
-  before = mjcf_model.size.nuserdata
   make_room(mjcf_model)
   try:
     yield
   finally:
-    mjcf_model.size.nuserdata = before
+    manage_room(mjcf_model)
+
+
+def _has_room(root: mjcf.RootElement) -> bool:
+  return root in _rooms and root.size.nuserdata == _rooms[root][1]
+
+
+def _own_size(root: mjcf.RootElement) -> int | None:
+  """Returns the `nuserdata` of a model without room for slots."""
+  return _rooms[root][0] if _has_room(root) else root.size.nuserdata
 
 
 def layout(model: Any) -> Mapping[str, int]:
@@ -195,15 +235,17 @@ def layout(model: Any) -> Mapping[str, int]:
   """
   if model in _layouts:
     return _layouts[model]
-  starts, end = {}, 0
+  sizes = {}
   for i in range(model.nnumeric):
     name = mujoco.mj_id2name(model.ptr, mujoco.mjtObj.mjOBJ_NUMERIC, i)
     if name.rpartition('/')[2].startswith(_PREFIX):
-      starts[name] = end
-      end += int(model.numeric_size[i])
-  if end > model.nuserdata:
+      sizes[name] = int(model.numeric_size[i])
+  needed = sum(sizes.values())
+  first = model.nuserdata - max(needed, CAPACITY)
+  if sizes and first < 0:
     raise errors.StateLayoutError(
-        f'{len(starts)} slots need {end} numbers of userdata; the model has'
+        f'{len(sizes)} slots need {needed} numbers of userdata; the model has'
         f' {model.nuserdata}; call state.make_room before it is compiled'
     )
-  return _layouts.setdefault(model, starts)
+  ends = itertools.accumulate(sizes.values(), initial=first)
+  return _layouts.setdefault(model, dict(zip(sizes, ends, strict=False)))

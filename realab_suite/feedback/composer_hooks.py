@@ -12,8 +12,7 @@ step, and before that lets the meters by themselves measure.
 """
 
 import abc
-from collections.abc import Callable
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, final
 
 from dm_control import composer
@@ -143,6 +142,12 @@ class ComposerHooks(_Hooks):
     # Substeps of the current control step so far.
     self._num_done = 0
 
+  def initialize_episode_mjcf(
+      self, random_state: np.random.RandomState
+  ) -> None:
+    del random_state
+    state.make_room(self.mjcf_model)
+
   def after_compile(
       self, physics: Any, random_state: np.random.RandomState
   ) -> None:
@@ -153,6 +158,7 @@ class ComposerHooks(_Hooks):
         does not fit the world.
     """
     del random_state
+    state.manage_room(self.mjcf_model)
     if self._count_substeps is not None:
       number = integers.check('num_substeps', self._count_substeps(), 1)
       self._fit_schedule(number)

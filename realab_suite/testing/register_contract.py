@@ -11,6 +11,7 @@ from realab_suite.engine import snapshots
 from realab_suite.entities import arenas
 from realab_suite.entities import block_kinds
 from realab_suite.entities import registers
+from realab_suite.entities import state
 from realab_suite.testing import contracts
 
 # Kinds of blocks: channel, dof and yaw of each register that is tried.
@@ -113,6 +114,7 @@ class _World:
     if any(block_kinds.find_misfit(block, substep) for block in blocks):
       substep = block_kinds.SHORT_SUBSTEP
     arena.mjcf_model.option.timestep = substep
+    state.make_room(arena.mjcf_model)
     self.physics = single_physics.ThinPhysics.from_mjcf_model(arena.mjcf_model)
     self.restart()
 

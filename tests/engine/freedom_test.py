@@ -16,6 +16,9 @@ import pytest
 
 from realab_suite import errors
 from realab_suite import suite
+from realab_suite.entities import meters
+from realab_suite.entities import registers
+from realab_suite.entities import state
 from realab_suite.feedback import mechanisms
 from realab_suite.feedback import specs
 from tests.engine import embedded
@@ -88,6 +91,7 @@ def _change_props(task: _Free, episode: int, random_state: Any) -> None:
       for i in range(episode)
   ]  # fmt: skip
   for prop in task.props:
+    prop.mjcf_model.size.nuserdata = 2
     task.root_entity.add_free_entity(prop)
     prop.observables.position.enabled = True
 
@@ -121,6 +125,15 @@ def _set_delays(task: _Free, episode: int, random_state: Any) -> None:
   task.secret.configure(enabled=episode == 1)
 
 
+def _write_userdata(task: _Free, episode: int, random_state: Any) -> None:
+  task.root_entity.mjcf_model.size.nuserdata = [1, 10, 1000][episode]
+
+  def write(physics: Any, random_state: Any) -> None:
+    physics.data.userdata[: task.root_entity.mjcf_model.size.nuserdata] += 1.0
+
+  task.end_step = write
+
+
 def _write_in_substeps(task: _Free, episode: int, random_state: Any) -> None:
   def write(physics: Any, random_state: Any) -> None:
     physics.model.opt.gravity[0] = random_state.uniform(-1, 1)
@@ -145,6 +158,10 @@ _FREEDOMS: dict[str, Any] = {
     'props': (_change_props, _find_props),
     'motors': (_add_motor, lambda task, physics: physics.model.nu),
     'delays': (_set_delays, lambda task, physics: task.bead.update_interval),
+    'userdata': (
+        _write_userdata,
+        lambda task, physics: task.root_entity.mjcf_model.size.nuserdata,
+    ),
     'the model in an episode': (
         _write_in_substeps,
         lambda task, physics: float(physics.bind(task.joint).damping[0]),
@@ -237,6 +254,87 @@ def test_a_schedule_that_does_not_fit_is_refused_in_composer(
   env.step(np.zeros(1))
   with pytest.raises(errors.SpecError, match=message):
     _ = env.reset(), env.step(np.zeros(1))
+
+
+# Registers beside userdata of the task.
+
+
+class _Owner(helpers.PointTask):
+  """Keeps numbers in the userdata of two nested models."""
+
+  def __init__(self, number: int) -> None:
+    super().__init__()
+    box = props.Primitive(geom_type='box', size=[0.1] * 3, pos=[0, 4, 1])
+    box.mjcf_model.size.nuserdata = number
+    self.root_entity.attach(box)
+    self.number = number
+    self.begin = lambda physics, random: self._set(physics, 7.0)
+    self.end_step = lambda physics, random: self._set(physics, physics.time())
+
+  def own(self, physics: Any) -> Any:
+    return physics.data.userdata[: self.number]
+
+  def _set(self, physics: Any, value: float) -> None:
+    self.own(physics)[:] = value
+
+
+def _attach_mechanism(task: _Owner) -> Any:
+  spec = specs.load({**helpers.SCORED, 'schedule': 'cfmdp'})
+  mechanism = mechanisms.FeedbackMechanism(spec)
+  task.root_entity.attach(mechanism)
+  mechanism.connect({'score': lambda physics: 3.0})
+  return mechanism.registers['score']
+
+
+def _attach_meter(task: _Owner) -> Any:
+  register = registers.TwoBlockRegister(
+      'score', value_range=(0, 20), scale=0.05, role='meter'
+  )
+  register.attach_to(task.root_entity, (2.0, -3.0))
+  task.root_entity.attach(meters.Meter(lambda physics: 3.0, register))
+  return register
+
+
+def _embed(task: _Owner) -> Any:
+  return suite.embed(
+      task,
+      helpers.SCORED,
+      random=1,
+      measurements={'three': lambda physics: 3.0},
+      overrides=['meters.0.measures=three'],
+  )
+
+
+@pytest.mark.parametrize('number', [1, 10, 256, 1000])
+@pytest.mark.parametrize('attach', [_attach_mechanism, _attach_meter, None])
+def test_userdata_of_a_task_and_slots_share_the_array(number: int, attach: Any):
+  task = _Owner(number)
+  if attach is None:
+    env = _embed(task)
+    register = env.mechanism.registers['score']
+  else:
+    register = attach(task)
+    env = composer.Environment(task)
+  for _ in range(3):
+    env.reset()
+    np.testing.assert_array_equal(task.own(env.physics), 7.0)
+    for _ in range(4):
+      env.step(np.zeros(1))
+      np.testing.assert_array_equal(task.own(env.physics), env.physics.time())
+      assert register.applied(env.physics) == 3.0
+    assert env.physics.model.nuserdata == number + state.CAPACITY
+
+
+def test_a_task_in_composer_may_change_its_userdata_beside_a_mechanism():
+  task = _Free(*_FREEDOMS['props'])
+  register = _attach_mechanism(task)
+  env = composer.Environment(task)
+  for number in range(3):
+    env.reset()
+    env.step(np.zeros(1))
+    assert len(task.props) == number
+    assert env.physics.model.nuserdata == state.CAPACITY + 2 * bool(number)
+    assert register.applied(env.physics) == 3.0
 
 
 # Observables and memory.

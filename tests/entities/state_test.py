@@ -93,7 +93,8 @@ def test_a_slot_attached_after_compiling_is_an_error():
 
 def test_more_slots_than_there_is_room_for_are_refused():
   arena, (counter, _) = _world(state.CAPACITY - 3, 2)
-  physics = worlds.compile_world(arena)
+  arena.mjcf_model.size.nuserdata = state.CAPACITY
+  physics = mjcf.Physics.from_mjcf_model(arena.mjcf_model)
   with pytest.raises(
       errors.StateLayoutError,
       match=rf'4 slots need {state.CAPACITY + 1} numbers .* {state.CAPACITY}',
