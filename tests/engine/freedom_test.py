@@ -34,7 +34,7 @@ class _Free(helpers.PointTask):
       look: Callable[[Any, Any], Any],
   ) -> None:
     super().__init__()
-    self.num_episodes = 0
+    self.num_episodes = self.num_own = 0
     # What the change made of the world at the start of each episode.
     self.looks: list[Any] = []
     self.props: list[composer.Entity] = []
@@ -55,29 +55,26 @@ class _Free(helpers.PointTask):
     return 0.9
 
 
-def _option(name: str, values: list[Any]) -> Any:
-  def change(task: _Free, episode: int, random_state: Any) -> None:
-    setattr(task.root_entity.mjcf_model.option, name, values[episode])
+def _look_at_options(task: _Free, physics: Any) -> list[Any]:
+  options = physics.model.opt
+  steps = task.physics_steps_per_control_step
+  return [steps, options.integrator, options.solver, *options.gravity]
 
-  return (
-      change,
-      lambda task, physics: np.array(getattr(physics.model.opt, name)).tolist(),
-  )
+
+def _assign(name: str, *values: Any) -> Any:
+  def change(task: _Free, episode: int, random_state: Any) -> None:
+    option = task.root_entity.mjcf_model.option
+    target = task if hasattr(task, name) else option
+    setattr(target, name, values[episode])
+
+  return change, _look_at_options
 
 
 def _timesteps(*steps: tuple[float, float]) -> Any:
   return (
       lambda task, episode, random_state: task.set_timesteps(*steps[episode]),
-      lambda task, physics: task.physics_steps_per_control_step,
+      _look_at_options,
   )
-
-
-def _set_physics_timestep(task: _Free, episode: int, random_state: Any) -> None:
-  task.physics_timestep = [0.025, 0.05, 0.01][episode]
-
-
-def _set_control_timestep(task: _Free, episode: int, random_state: Any) -> None:
-  task.control_timestep = [0.03, 0.01, 0.07][episode]
 
 
 def _change_props(task: _Free, episode: int, random_state: Any) -> None:
@@ -96,16 +93,18 @@ def _change_props(task: _Free, episode: int, random_state: Any) -> None:
     prop.observables.position.enabled = True
 
 
-def _find_props(task: _Free, physics: Any) -> list[int]:
-  return [
-      len(task.props),
-      sum(physics.model.geom_type == mujoco.mjtGeom.mjGEOM_BOX),
-  ]
+def _find_props(task: _Free, physics: Any) -> Any:
+  boxes = physics.model.geom_type == mujoco.mjtGeom.mjGEOM_BOX
+  return len(task.props), boxes.sum()
 
 
 def _set_friction(task: _Free, episode: int, random_state: Any) -> None:
   task.joint.frictionloss = random_state.uniform(0.0, 0.5)
   task.joint.damping = episode
+
+
+def _look_at_joint(task: _Free, physics: Any) -> float:
+  return float(physics.bind(task.joint).damping[0])
 
 
 def _add_motor(task: _Free, episode: int, random_state: Any) -> None:
@@ -126,15 +125,16 @@ def _set_delays(task: _Free, episode: int, random_state: Any) -> None:
 
 
 def _write_userdata(task: _Free, episode: int, random_state: Any) -> None:
-  task.root_entity.mjcf_model.size.nuserdata = [1, 10, 1000][episode]
+  task.num_own = [1, 10, 1000][episode]
+  task.root_entity.mjcf_model.size.nuserdata = task.num_own
 
   def write(physics: Any, random_state: Any) -> None:
-    physics.data.userdata[: task.root_entity.mjcf_model.size.nuserdata] += 1.0
+    physics.data.userdata[: task.num_own] += 1.0
 
   task.end_step = write
 
 
-def _write_in_substeps(task: _Free, episode: int, random_state: Any) -> None:
+def _write_in_steps(task: _Free, episode: int, random_state: Any) -> None:
   def write(physics: Any, random_state: Any) -> None:
     physics.model.opt.gravity[0] = random_state.uniform(-1, 1)
     physics.bind(task.joint).damping = random_state.uniform()
@@ -145,27 +145,17 @@ def _write_in_substeps(task: _Free, episode: int, random_state: Any) -> None:
 _FREEDOMS: dict[str, Any] = {
     'timesteps': _timesteps((0.02, 0.005), (0.02, 0.001), (0.1, 0.01)),
     'one substep': _timesteps((0.05, 0.01), (0.03, 0.03), (0.02, 0.01)),
-    'physics timestep': (_set_physics_timestep, _timesteps()[1]),
-    'control timestep': (_set_control_timestep, _timesteps()[1]),
-    'gravity': _option('gravity', [[1, 0, 0], [0, 0, -9.81], [-3, 0, 1]]),
-    'integrator': _option('integrator', ['Euler', 'RK4', 'implicit']),
-    'solver': _option('solver', ['PGS', 'Newton', 'CG']),
-    'wind': _option('wind', [[1, 0, 0], [0, 0, 0], [-9, 0, 0]]),
-    'friction': (
-        _set_friction,
-        lambda task, physics: float(physics.bind(task.joint).damping[0]),
-    ),
+    'physics timestep': _assign('physics_timestep', 0.025, 0.05, 0.01),
+    'control timestep': _assign('control_timestep', 0.03, 0.01, 0.07),
+    'gravity': _assign('gravity', [1, 0, 0], [0, 0, -9], [-3, 0, 1]),
+    'integrator': _assign('integrator', 'Euler', 'RK4', 'implicit'),
+    'solver': _assign('solver', 'PGS', 'Newton', 'CG'),
+    'friction': (_set_friction, _look_at_joint),
     'props': (_change_props, _find_props),
     'motors': (_add_motor, lambda task, physics: physics.model.nu),
     'delays': (_set_delays, lambda task, physics: task.bead.update_interval),
-    'userdata': (
-        _write_userdata,
-        lambda task, physics: task.root_entity.mjcf_model.size.nuserdata,
-    ),
-    'the model in an episode': (
-        _write_in_substeps,
-        lambda task, physics: float(physics.bind(task.joint).damping[0]),
-    ),
+    'userdata': (_write_userdata, lambda task, physics: task.num_own),
+    'the model in an episode': (_write_in_steps, _look_at_joint),
 }
 
 
@@ -216,13 +206,14 @@ def test_a_schedule_that_no_longer_fits_is_refused():
     env.reset()
 
 
-def _attached(num_substeps: Any, **others: Any) -> Any:
-  """Returns Composer's environment of a task that changes its timesteps."""
+def _attached(num_substeps: int | None, **others: Any) -> Any:
+  """Returns Composer's environment; 0 substeps for a function."""
   task = _slower()
-  count = num_substeps and (lambda: task.physics_steps_per_control_step)
   mechanism = mechanisms.FeedbackMechanism(
       specs.load({**helpers.SCORED, **others}),
-      num_substeps if isinstance(num_substeps, int) else count,
+      (lambda: task.physics_steps_per_control_step)
+      if num_substeps == 0
+      else num_substeps,
   )
   task.root_entity.attach(mechanism)
   mechanism.connect({'score': lambda physics: physics.time()})
@@ -230,7 +221,7 @@ def _attached(num_substeps: Any, **others: Any) -> Any:
 
 
 def test_the_schedule_in_composer_follows_a_function():
-  env, mechanism = _attached('counted')
+  env, mechanism = _attached(0)
   for written in (0.006, 0.005, 0.0):
     env.reset()
     env.step(np.zeros(1))
@@ -243,11 +234,11 @@ def test_the_schedule_in_composer_follows_a_function():
     [
         (20, None, 'num_substeps: 20; must be 4, .* pass num_substeps=lambda'),
         (None, _FIXED, _REFUSAL),
-        ('counted', _FIXED, _REFUSAL),
+        (0, _FIXED, _REFUSAL),
     ],
 )
 def test_a_schedule_that_does_not_fit_is_refused_in_composer(
-    num_substeps: Any, schedule: Any, message: str
+    num_substeps: int | None, schedule: Any, message: str
 ):
   env, _ = _attached(num_substeps, schedule=schedule)
   env.reset()
@@ -260,7 +251,7 @@ def test_a_schedule_that_does_not_fit_is_refused_in_composer(
 
 
 class _Owner(helpers.PointTask):
-  """Keeps numbers in the userdata of two nested models."""
+  """Keeps numbers in the userdata that a nested model declares."""
 
   def __init__(self, number: int) -> None:
     super().__init__()
@@ -295,22 +286,17 @@ def _attach_meter(task: _Owner) -> Any:
   return register
 
 
-def _embed(task: _Owner) -> Any:
-  return suite.embed(
-      task,
-      helpers.SCORED,
-      random=1,
-      measurements={'three': lambda physics: 3.0},
-      overrides=['meters.0.measures=three'],
-  )
-
-
 @pytest.mark.parametrize('number', [1, 10, 256, 1000])
 @pytest.mark.parametrize('attach', [_attach_mechanism, _attach_meter, None])
 def test_userdata_of_a_task_and_slots_share_the_array(number: int, attach: Any):
   task = _Owner(number)
   if attach is None:
-    env = _embed(task)
+    env = suite.embed(
+        task,
+        helpers.SCORED,
+        measurements={'three': lambda physics: 3.0},
+        overrides=['meters.0.measures=three'],
+    )
     register = env.mechanism.registers['score']
   else:
     register = attach(task)
