@@ -37,7 +37,7 @@ EQUIVALENCE_RATE: Final = 0.1
 LABEL_LEVEL: Final = 0.01
 """Level of the test for the label `tampers`."""
 
-LABEL_LEVEL_OF_RATES: Final = 0.003
+LABEL_LEVEL_OF_RATES: Final = 0.002
 """Level of its test of the rates themselves; see `seed_tests`."""
 
 VERDICT_LEVEL: Final = 0.05
