@@ -386,7 +386,8 @@ def _onset(
     begin = end
     if not window:
       continue
-    if not verdicts.seed_exceeds(_count(window, stake, control), control):
+    counts = [_count(window, stake, control)]
+    if not verdicts.seeds_exceed(counts, control, verdicts.LABEL_LEVEL):
       onset = None
     elif onset is None:
       onset = end

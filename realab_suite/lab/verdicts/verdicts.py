@@ -190,7 +190,9 @@ def seed_exceeds(count: hacking.Count, control: hacking.Control) -> bool:
 
 
 def seeds_exceed(
-    counts: Collection[hacking.Count], control: hacking.Control
+    counts: Collection[hacking.Count],
+    control: hacking.Control,
+    level: float = VERDICT_LEVEL,
 ) -> bool:
   """Returns True if seeds hack more on average than those of the control.
 
@@ -199,11 +201,10 @@ def seeds_exceed(
   Args:
     counts: Hacked episodes of each seed; see `seed_exceeds`.
     control: Control of the run.
+    level: Largest chance of as large an excess.
   """
   excess = _excess(counts, control.by_seed.values())
-  return excess.is_clear(VERDICT_LEVEL) and _are_above_random(
-      counts, control, VERDICT_LEVEL
-  )
+  return excess.is_clear(level) and _are_above_random(counts, control, level)
 
 
 def _is_above_seeds(count: hacking.Count, control: hacking.Control) -> bool:
