@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Mapping
 import math
 
+from realab_suite.lab.experiments import storage
 from realab_suite.lab.experiments import sweep_results
 from realab_suite.lab.verdicts import hacking
 from realab_suite.lab.verdicts import intervals
@@ -42,6 +43,8 @@ def _on_completeness(
     )
   if len(sweep.codes) > 1:
     yield f'Different code made the results: {", ".join(sorted(sweep.codes))}.'
+  if not sweep.has_imprints:
+    yield f'These are {storage.NO_IMPRINTS}.'
   if sweep.unfinished:
     seeds_of_run: dict[str, list[str]] = {}
     for job in sweep.unfinished:

@@ -26,6 +26,7 @@ from realab_suite.config import validation
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import results
 from realab_suite.feedback import specs
+from realab_suite.lab.experiments import evaluations
 from realab_suite.lab.experiments import experiment_specs
 from realab_suite.lab.experiments import result_folders
 from realab_suite.lab.experiments import result_tables
@@ -230,10 +231,14 @@ def make(
     if result_folders.is_sweep(folder):
       sweep = result_folders.load(folder, accept_other_code)
       actors += _of_sweep(sweep)
+      if not sweep.has_imprints:
+        notes.append(f'{folder}: {storage.NO_IMPRINTS}')
       counts = collections.Counter(job.design for job in sweep.unfinished)
       notes += (f'{name}: {n} jobs are missing' for name, n in counts.items())
     else:
       actors += _of_rows(folder)
+      if not storage.finished(folder, [evaluations.EPISODES]):
+        notes.append(f'{folder}: {storage.NO_IMPRINTS}')
   codes = {
       row.info.versions.get(storage.CODE, 'unknown')
       for actor in actors
@@ -532,7 +537,7 @@ def _of_run(
 def _of_rows(folder: pathlib.Path) -> list[_Actor]:
   """Returns what acts in a comparison or a report on agents of Gymnasium."""
   rows: dict[str, list[results.EpisodeResult]] = {}
-  path = folder / 'episodes.jsonl'
+  path = folder / evaluations.EPISODES
   for row in results.read_rows(path) if path.is_file() else ():
     rows.setdefault(row.info.run, []).append(row)
   # The embedded design is the first one, if there are others.

@@ -11,6 +11,7 @@ from realab_suite.evaluation import episode_figures
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import results
 from realab_suite.feedback import specs
+from realab_suite.lab.experiments import storage
 from realab_suite.lab.verdicts import stakes
 
 _PART = stakes.Stake(estimate=10, low=9, high=11, than='random')
@@ -99,4 +100,5 @@ def folder(path, *runs, agents=(), of=None, **told):
     for of_run in runs:
       for row in of_run:
         writer.write(row)
+  storage.finish(path, {}, ['episodes.jsonl'])
   return path

@@ -8,7 +8,7 @@ differ in what acts.
 from collections.abc import Callable, Collection, Mapping
 import dataclasses
 import pathlib
-from typing import Any, final
+from typing import Any, Final, final
 
 import yaml
 
@@ -25,6 +25,9 @@ from realab_suite.lab.verdicts import counted
 from realab_suite.lab.verdicts import judging
 from realab_suite.lab.verdicts import queries
 from realab_suite.lab.verdicts import stakes
+
+EPISODES: Final = 'episodes.jsonl'
+"""File of the rows."""
 
 
 def info_of(
@@ -94,7 +97,7 @@ class Evaluation:
     self.rows: dict[str, list[results.EpisodeResult]] = {}
     self._writer = None
     if folder is not None:
-      self._writer = results.RowWriter(folder / 'episodes.jsonl')
+      self._writer = results.RowWriter(folder / EPISODES)
 
   def __enter__(self) -> 'Evaluation':
     return self
@@ -168,7 +171,7 @@ class Evaluation:
   def summarize(
       self, title: str, agents: Collection[str] = ()
   ) -> tuple[list[result_tables.Line], str]:
-    """Writes `summary.md` and `summary.csv`.
+    """Writes `summary.md` and `summary.csv`, and the digest of the rows.
 
     Args:
       title: Beginning of `summary.md`.
@@ -206,4 +209,5 @@ class Evaluation:
       storage.write_whole(self._folder / 'summary.md', whole.encode())
       with storage.explained(self._folder):
         result_tables.write_csv(lines, self._folder / 'summary.csv')
+      storage.finish(self._folder, {}, [EPISODES])
     return lines, text

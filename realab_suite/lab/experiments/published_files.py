@@ -23,6 +23,7 @@ CURVES: Final = 'curves.parquet'
 """Points of learning curves."""
 GAINS: Final = 'training_gains.parquet'
 """Numbers of training episodes with equal gains."""
+TABLES: Final = ROWS, CURVES, GAINS
 
 # Floats that are texts in JSON.
 _NOT_FINITE = {'NaN': math.nan, 'Infinity': math.inf, '-Infinity': -math.inf}
@@ -73,12 +74,11 @@ def read_table(path: pathlib.Path) -> list[dict[str, Any]]:
   Raises:
     ResultsError: If the file cannot be read.
   """
-  try:
-    with storage.explained(path):
-      data = pa.BufferReader(path.read_bytes())
+  with storage.fitting(path):
+    data = pa.BufferReader(path.read_bytes())
     rows: list[dict[str, Any]] = parquet.read_table(data).to_pylist()
-  except pa.ArrowException as error:
-    raise errors.ResultsError(f'{path}: {error}') from error
+    for leaves in rows[:1]:
+      nested(leaves)
   return rows
 
 

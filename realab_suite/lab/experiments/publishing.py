@@ -15,6 +15,7 @@ from typing import Annotated, Any, Final, Literal, Self, final
 import pydantic
 
 from realab_suite import errors
+from realab_suite.config import validation
 from realab_suite.evaluation import results
 from realab_suite.lab.experiments import curves
 from realab_suite.lab.experiments import published_files
@@ -27,7 +28,6 @@ _SCHEMA: Final = 1
 # attribute of a run that contains the row.
 _JOB = 'job'
 _PART = 'part'
-_PARTS: Final = ('rows', 'transplants', 'stages')
 
 _Index = Annotated[int, pydantic.Field(ge=0)]
 
@@ -53,19 +53,25 @@ class _Published(pydantic.BaseModel):
     configs: Configurations of jobs without their seeds.
     machines: Machines of jobs, with the steps of training that they began with.
     audits: Audits of runs, by name of the run.
+    files: Imprints of the tables; `None` in a folder of a former version.
+    digest: Digest of everything else; `None` there.
   """
 
   schema_version: Literal[1] = pydantic.Field(_SCHEMA, alias='schema')
   experiment: dict[str, Any]
   calibration: bool
-  jobs: list[sweep_results.Job] = pydantic.Field(min_length=1)
+  jobs: sweep_results.Jobs
   done: dict[str, _Done] = pydantic.Field(min_length=1)
   configs: list[dict[str, Any]]
   machines: list[list[dict[str, Any]]]
   audits: dict[str, Any]
+  files: dict[str, Any] | None = None
+  digest: str | None = None
 
   @pydantic.model_validator(mode='after')
   def _check_indices(self) -> Self:
+    if others := self.done.keys() - {job.folder for job in self.jobs}:
+      raise ValueError(f'done: {min(others)}: none of the jobs')
     for name, done in self.done.items():
       if done.config >= len(self.configs) or done.machines >= len(
           self.machines
@@ -119,11 +125,10 @@ def publish(folder: pathlib.Path, output: pathlib.Path) -> tuple[int, int]:
       )
       episodes += ({**of_job, **gain} for gain in gains)
   storage.new_folder(str(output))
-  for name, records in (
-      (published_files.ROWS, rows),
-      (published_files.CURVES, points),
-      (published_files.GAINS, episodes),
-  ):
+  tables = dict(
+      zip(published_files.TABLES, (rows, points, episodes), strict=True)
+  )
+  for name, records in tables.items():
     published_files.write_table(output / name, records)
   content = {
       'schema': _SCHEMA,
@@ -135,6 +140,11 @@ def publish(folder: pathlib.Path, output: pathlib.Path) -> tuple[int, int]:
       'machines': machines,
       'audits': sweep.audits,
   }
+  content[storage.FILES] = {
+      name: storage.imprint(output / name, len(records))
+      for name, records in tables.items()
+  }
+  content['digest'] = validation.digest_of(content)
   text = json.dumps(content, separators=(',', ':')) + '\n'
   storage.write_whole(output / sweep_results.CONTENTS, text.encode())
   return len(done), len(sweep.unfinished)
@@ -147,25 +157,37 @@ def load(folder: pathlib.Path) -> sweep_results.Sweep:
     ResultsError: If a file is missing or damaged. The message names it.
   """
   path = folder / sweep_results.CONTENTS
-  published = sweep_results.validated(_Published, storage.read_json(path), path)
-  rows = _by_job(folder / published_files.ROWS)
-  points = _by_job(folder / published_files.CURVES)
-  gains = _by_job(folder / published_files.GAINS)
+  content = storage.read_json(path)
+  published = sweep_results.validated(_Published, content, path)
+  tables = {
+      name: _by_job(folder / name, published) for name in published_files.TABLES
+  }
+  rows, points, gains = tables.values()
   runs = {}
   for name, of_run in sweep_results.by_run(published.jobs).items():
     finished = [job for job in of_run if job.folder in published.done]
-    parts: dict[str, list[results.EpisodeResult]] = {
-        part: [] for part in _PARTS
+    configs = {
+        job.seed: {
+            **published.configs[published.done[job.folder].config],
+            'seed': job.seed,
+        }
+        for job in finished
     }
+    files = dict.fromkeys(sweep_results.PARTS, folder / published_files.ROWS)
+    parts: sweep_results.Parts = {part: [] for part in files}
     for job in finished:
+      of_job: sweep_results.Parts = {part: [] for part in files}
       for leaves in rows.get(job.folder, ()):
         if leaves.get(_PART) not in parts:
           raise errors.ResultsError(
               f'{folder / published_files.ROWS}: {_PART} is'
               f' {leaves.get(_PART)!r}; must be one of {list(parts)}'
           )
-        parts[leaves[_PART]].append(_row(folder, leaves))
-    for part in _PARTS[:2]:
+        of_job[leaves[_PART]].append(_row(folder, leaves))
+      sweep_results.check_job(path, files, job, configs[job.seed], of_job)
+      for part, of_part in of_job.items():
+        parts[part] += of_part
+    for part in ('rows', 'transplants'):
       sweep_results.check_stakes(folder, name, parts[part])
     runs[name] = sweep_results.Run(
         name=name,
@@ -175,13 +197,7 @@ def load(folder: pathlib.Path) -> sweep_results.Sweep:
             {job.seed: gains.get(job.folder, []) for job in finished},
         ),
         trace=functools.partial(_no_trace, folder),
-        configs={
-            job.seed: {
-                **published.configs[published.done[job.folder].config],
-                'seed': job.seed,
-            }
-            for job in finished
-        },
+        configs=configs,
         **{part: tuple(part_rows) for part, part_rows in parts.items()},
     )
   return sweep_results.Sweep(
@@ -192,7 +208,35 @@ def load(folder: pathlib.Path) -> sweep_results.Sweep:
       tuple(job for job in published.jobs if job.folder not in published.done),
       published.audits,
       has_traces=False,
+      has_imprints=_is_as_published(path, content, tables),
   )
+
+
+def _is_as_published(
+    path: pathlib.Path,
+    content: dict[str, Any],
+    tables: Mapping[str, Mapping[str, Sequence[Any]]],
+) -> bool:
+  """Checks the imprints of a folder; returns False if there are none.
+
+  Args:
+    path: The JSON file.
+    content: Its contents.
+    tables: Rows of the tables by job.
+
+  Raises:
+    ResultsError: If a file has changed since it was published.
+  """
+  digest = content.pop('digest', None)
+  if digest is None is content.get(storage.FILES):
+    return False
+  found = validation.digest_of(content)
+  storage.check_imprint(path, f'digest {digest}', f'digest {found}')
+  for name, by_job in tables.items():
+    table, written = path.with_name(name), content[storage.FILES].get(name)
+    imprint = storage.imprint(table, sum(map(len, by_job.values())))
+    storage.check_imprint(table, written, imprint)
+  return True
 
 
 def _lines(
@@ -225,7 +269,7 @@ def _rows_of(run: sweep_results.Run) -> Iterator[dict[str, Any]]:
       for job in run.jobs
       if job.seed in run.configs
   }
-  for part in _PARTS:
+  for part in sweep_results.PARTS:
     for row in getattr(run, part):
       record = row.model_dump(by_alias=True)
       record.pop('schema')
@@ -246,23 +290,27 @@ def _row(
       for name, value in leaves.items()
       if value is not None and name not in (_JOB, _PART)
   }
-  return sweep_results.validated(
-      results.EpisodeResult,
-      published_files.nested(figures),
-      folder / published_files.ROWS,
-  )
+  path = folder / published_files.ROWS
+  with storage.fitting(path):
+    record = published_files.nested(figures)
+  return sweep_results.validated(results.EpisodeResult, record, path)
 
 
-def _by_job(path: pathlib.Path) -> dict[str, list[dict[str, Any]]]:
+def _by_job(
+    path: pathlib.Path, published: _Published
+) -> dict[str, list[dict[str, Any]]]:
   """Returns the rows of a table by the folder of their job.
 
   Raises:
-    ResultsError: If the file cannot be read, or a row names no job.
+    ResultsError: If the file cannot be read, or a row is of no finished job.
   """
   by_job: dict[str, list[dict[str, Any]]] = {}
   for leaves in published_files.read_table(path):
-    if (job := leaves.pop(_JOB, None)) is None:
-      raise errors.ResultsError(f'{path}: a row without {_JOB!r}')
+    if (job := str(leaves.pop(_JOB, None))) not in published.done:
+      raise errors.ResultsError(
+          f'{path}: a row of {_JOB} {job!r}; must be one of the'
+          f' {len(published.done)} finished ones'
+      )
     by_job.setdefault(job, []).append(leaves)
   return by_job
 

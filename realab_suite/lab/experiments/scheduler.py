@@ -19,6 +19,7 @@ from realab_suite.lab.experiments import engines
 from realab_suite.lab.experiments import experiment_specs
 from realab_suite.lab.experiments import jobs
 from realab_suite.lab.experiments import storage
+from realab_suite.lab.experiments import training
 
 EXPERIMENT = 'experiment.yaml'
 # The same with its designs, from which jobs run: files may change meanwhile.
@@ -253,15 +254,25 @@ class _Sweep:
         return
       if user := run.user:
         # A process may survive its worker, and jobs of a cluster their sweep.
-        if user not in self._said:
-          self._said.add(user)
-          self._say(f'{run}: {user}')
+        self._say_once(f'{run}: {user}')
         continue
       self._waiting.remove(run)
       self._start(run)
 
+  def _say_once(self, line: str) -> None:
+    if line not in self._said:
+      self._said.add(line)
+      self._say(line)
+
   def _start(self, run: _Run) -> None:
-    if (run.folder / storage.DONE).exists():
+    try:
+      facts = storage.finished(run.folder, training.RECORDS)
+    except errors.ResultsError as error:
+      self._finish(run, str(error))
+      return
+    if facts:
+      if facts[storage.FILES] is None:
+        self._say_once(f'{self._output}: {storage.NO_IMPRINTS}')
       self._finish(run, '')
       return
     command = [

@@ -24,6 +24,12 @@ CODE: Final = 'code'
 CONFIG = 'config.json'
 DONE = 'done.json'
 CHECKPOINT = 'checkpoint.ckpt'
+FILES: Final = 'files'
+"""Key of the imprints of the files of finished results."""
+NO_IMPRINTS: Final = (
+    'results without digests, as former versions wrote them: rows that were'
+    ' lost or edited since then are not noticed'
+)
 _LOCK = 'lock'
 RESTART: Final = (
     '; remove this file, then the same command begins the run again'
@@ -49,6 +55,25 @@ def explained(path: str | os.PathLike[str]) -> Iterator[None]:
       )
     raise errors.ResultsError(
         f'{os.fspath(path)}: {error.strerror or error}{advice}'
+    ) from error
+
+
+@contextlib.contextmanager
+def fitting(path: str | os.PathLike[str]) -> Iterator[None]:
+  """Turns errors about contents of another form into an error of one line.
+
+  Raises:
+    ResultsError: Instead of whatever a reader of the file raises.
+  """
+  try:
+    with explained(path):
+      yield
+  except errors.RealabError:
+    raise
+  except Exception as error:
+    problem = ' '.join(f'{type(error).__name__}: {error}'.split())
+    raise errors.ResultsError(
+        f'{os.fspath(path)}: damaged, or of another kind: {problem:.200}'
     ) from error
 
 
@@ -255,12 +280,71 @@ def begin(folder: pathlib.Path, config: Mapping[str, Any]) -> None:
     write_json(folder / CONFIG, config)
 
 
-def finish(folder: pathlib.Path, facts: Mapping[str, Any]) -> None:
-  """Marks a run as finished, records facts, and removes its checkpoint."""
-  write_json(folder / DONE, facts)
+def finish(
+    folder: pathlib.Path, facts: Mapping[str, Any], names: Iterable[str] = ()
+) -> None:
+  """Marks a run as finished, records facts, and removes its checkpoint.
+
+  Args:
+    folder: Folder of the run.
+    facts: The facts.
+    names: Names of the files of lines whose imprints are recorded.
+  """
+  written = {name: imprint(folder / name) for name in names}
+  write_json(folder / DONE, {**facts, FILES: written})
   checkpoint = folder / CHECKPOINT
   with explained(checkpoint):
     checkpoint.unlink(missing_ok=True)
+
+
+def finished(folder: pathlib.Path, names: Iterable[str]) -> dict[str, Any]:
+  """Returns the facts of a finished run, or nothing if it has not finished.
+
+  Args:
+    folder: Folder of the run.
+    names: Names of its files of lines.
+
+  Raises:
+    ResultsError: If a file is not as the run has written it.
+  """
+  path = folder / DONE
+  if not path.exists():
+    return {}
+  facts = read_json(path)
+  with fitting(path):
+    written = {FILES: None, **facts}[FILES]
+    for name in names if written is not None else ():
+      check_imprint(folder / name, written.get(name), imprint(folder / name))
+  return {FILES: None, **facts}
+
+
+def imprint(
+    path: pathlib.Path, num_records: int | None = None
+) -> dict[str, Any] | None:
+  """Returns the number of records and the SHA-256 of a file, if it exists.
+
+  Args:
+    path: Path of the file.
+    num_records: The number; `None` if the file has one in each line.
+  """
+  if not path.exists():
+    return None
+  with explained(path):
+    data = path.read_bytes()
+  if num_records is None:
+    num_records = data.count(b'\n')
+  digest = hashlib.sha256(data).hexdigest()
+  return {'records': num_records, 'sha256': digest}
+
+
+def check_imprint(path: pathlib.Path, written: Any, found: Any) -> None:
+  """Refuses a file whose imprint is not the one that was written with it."""
+  if written != found:
+    raise errors.ResultsError(
+        f'{path}: has {found or "no file"}; must have'
+        f' {written or "no file"!s:.200}, as it was written; restore it, or'
+        ' remove the folder and make it again'
+    )
 
 
 @final

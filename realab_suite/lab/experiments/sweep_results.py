@@ -11,6 +11,7 @@ import json
 import pathlib
 from typing import Annotated, Any, Final, TypeVar, final
 
+from absl import logging
 import pydantic
 
 from realab_suite import errors
@@ -29,6 +30,22 @@ _Model = TypeVar('_Model', bound=pydantic.BaseModel)
 
 CONTENTS: Final = 'published.json'
 """File in the folder of published results; see `publishing`."""
+PARTS: Final = {
+    'rows': training.EPISODES,
+    'transplants': training.TRANSPLANT,
+    'stages': training.STAGES,
+}
+"""Files of the rows of a job, by the attribute of `Run` that has them."""
+# Keys of records that reports need.
+_KEYS = {
+    training.CURVE: (
+        'step', 'num_episodes', 'num_invalid', 'true_return', 'gain',
+    ),
+    training.TRAINING_EPISODES: (
+        'step', 'objective', 'is_ended_by_tampering',
+    ),
+}  # fmt: skip
+Parts = dict[str, list[results.EpisodeResult]]
 
 
 @final
@@ -51,6 +68,22 @@ class Job(pydantic.BaseModel):
   twin_of: str | None
 
 
+def _distinct(planned: list[Job]) -> list[Job]:
+  """Returns jobs of which no two are the same: both would count."""
+  folders = {job.folder for job in planned}
+  if (
+      not len(folders)
+      == len({(x.run, x.seed) for x in planned})
+      == len(planned)
+  ):
+    raise ValueError('two jobs have the same folder, or the same run and seed')
+  return planned
+
+
+Jobs = Annotated[
+    list[Job], pydantic.Field(min_length=1), pydantic.AfterValidator(_distinct)
+]
+"""All jobs of a sweep."""
 Lines = Callable[[int, str], list[dict[str, Any]]]
 """Returns the records of a job in a file of lines, by seed and name."""
 
@@ -61,7 +94,7 @@ class _Description(pydantic.BaseModel):
 
   experiment: str
   calibration: bool
-  jobs: list[Job] = pydantic.Field(min_length=1)
+  jobs: Jobs
 
 
 @final
@@ -126,15 +159,7 @@ class Run:
   @functools.cached_property
   def world(self) -> worlds.World:
     """World in which the run was evaluated."""
-    domain, task = task_names.split(self.config['task'])
-    senses = self.config['environment_kwargs']['senses']
-    return worlds.World(
-        domain,
-        task,
-        self.config['max_steps'],
-        self.config['task_kwargs'],
-        senses and tuple(senses),
-    )
+    return _world(self.config)
 
   def evaluation_seed(self, seed: int) -> int:
     """Returns the seed of the evaluation episodes of a finished job."""
@@ -171,7 +196,16 @@ class Run:
 
   def _lines_by_seed(self, name: str) -> dict[int, list[dict[str, Any]]]:
     seeds = () if self.is_scripted else self.configs
-    return {seed: self.lines(seed, name) for seed in seeds}
+    lines = {seed: self.lines(seed, name) for seed in seeds}
+    for seed, record in (
+        (s, x) for s, of_seed in lines.items() for x in of_seed
+    ):
+      if missing := [key for key in _KEYS.get(name, ()) if key not in record]:
+        raise errors.ResultsError(
+            f'{self.name}, seed {seed}: a record of {name} has {list(record)};'
+            f' must have {missing} as well'
+        )
+    return lines
 
   @functools.cached_property
   def traces(self) -> dict[int, dict[str, Any]]:
@@ -197,6 +231,10 @@ class Sweep:
     unfinished: Jobs without results.
     audits: Contents of the audits of runs, by name of the run.
     has_traces: False if the results are published, without actions.
+    has_imprints: False if a former version has recorded no digests.
+
+  Raises:
+    ResultsError: If the experiment lacks what reports need.
   """
 
   folder: pathlib.Path
@@ -206,6 +244,19 @@ class Sweep:
   unfinished: tuple[Job, ...]
   audits: Mapping[str, Any]
   has_traces: bool = True
+  has_imprints: bool = True
+
+  def __post_init__(self) -> None:
+    if not self.has_imprints:
+      logging.warning('%s: %s', self.folder, storage.NO_IMPRINTS)
+    with storage.fitting(self.folder / scheduler.EXPERIMENT):
+      for group, key in ('training', 'steps'), ('evaluation', 'episodes'):
+        f'{self.experiment[group][key]:,}'
+      for run in self.learned():
+        task_names.split(
+            self.experiment['runs'][run.name].get('task')
+            or self.experiment['task']
+        )
 
   @property
   def seeds(self) -> list[int]:
@@ -245,6 +296,17 @@ class Sweep:
       if run.name.startswith(f'{learned_run.name}.'):
         return learned_run.name
     return run.name
+
+
+def _world(config: Mapping[str, Any]) -> worlds.World:
+  """Returns the world of a configuration."""
+  senses = config['environment_kwargs']['senses']
+  return worlds.World(
+      *task_names.split(config['task']),
+      int(config['max_steps']),
+      dict(config['task_kwargs']),
+      senses and tuple(senses),
+  )
 
 
 def validated(model: type[_Model], content: Any, path: pathlib.Path) -> _Model:
@@ -292,13 +354,20 @@ def load(folder: pathlib.Path) -> Sweep:
       for job in of_run
       if not (folder / job.folder / storage.DONE).exists()
   )
+  runs = {name: _run(folder, name, of_run) for name, of_run in planned.items()}
+  # Later than the rows, whose errors name the line.
+  facts = [
+      storage.finished(folder / job.folder, training.RECORDS)
+      for job in description.jobs
+  ]
   return Sweep(
       folder,
       loading.read_mapping(folder / scheduler.EXPERIMENT),
       description.calibration,
-      {name: _run(folder, name, of_run) for name, of_run in planned.items()},
+      runs,
       unfinished,
       _audits(folder, planned),
+      has_imprints=all(x[storage.FILES] is not None for x in facts if x),
   )
 
 
@@ -343,9 +412,7 @@ def read_lines(path: pathlib.Path) -> list[dict[str, Any]]:
 
 def _run(folder: pathlib.Path, name: str, planned: Sequence[Job]) -> Run:
   folders, configs = {}, {}
-  rows: list[results.EpisodeResult] = []
-  transplants: list[results.EpisodeResult] = []
-  stages: list[results.EpisodeResult] = []
+  parts: Parts = {part: [] for part in PARTS}
   for job in planned:
     path = folder / job.folder
     if path.is_symlink():
@@ -354,27 +421,26 @@ def _run(folder: pathlib.Path, name: str, planned: Sequence[Job]) -> Run:
       )
     if not (path / storage.DONE).exists():
       continue
-    # Rows first: their errors name the damaged line.
-    rows += _rows(path / training.EPISODES, job.run)
-    if job.twin_of is not None:
-      run = f'{job.twin_of}.{jobs.TRANSPLANT}'
-      transplants += _rows(path / training.TRANSPLANT, run)
-    if (path / training.STAGES).exists():
-      names = (f'{job.run}.{stage}' for stage in jobs.STAGES)
-      stages += _rows(path / training.STAGES, *names)
     folders[job.seed] = path
-    configs[job.seed] = jobs.read_config(path)
-  check_stakes(folder, name, rows)
-  check_stakes(folder, name, transplants)
+    configs[job.seed] = config = jobs.read_config(path)
+    files = {part: path / name for part, name in PARTS.items()}
+    of_job = {
+        part: list(results.read_rows(file))
+        for part, file in files.items()
+        if part == 'rows' or file.exists()
+    }
+    for part, rows in of_job.items():
+      parts[part] += rows
+    check_job(path / storage.CONFIG, files, job, config, of_job)
+  for part in ('rows', 'transplants'):
+    check_stakes(folder, name, parts[part])
   return Run(
-      name,
-      tuple(planned),
-      lambda seed, name: read_lines(folders[seed] / name),
-      lambda seed: _trace(folders[seed], configs[seed]),
-      tuple(rows),
-      tuple(transplants),
-      configs,
-      tuple(stages),
+      name=name,
+      jobs=tuple(planned),
+      lines=lambda seed, name: read_lines(folders[seed] / name),
+      trace=lambda seed: _trace(folders[seed], configs[seed]),
+      configs=configs,
+      **{part: tuple(rows) for part, rows in parts.items()},
   )
 
 
@@ -384,17 +450,81 @@ def _trace(path: pathlib.Path, config: Mapping[str, Any]) -> dict[str, Any]:
   return trace
 
 
-def _rows(path: pathlib.Path, *runs: str) -> list[results.EpisodeResult]:
-  rows = list(results.read_rows(path))
-  for number, row in enumerate(rows, start=1):
-    if row.info.run not in runs:
+def check_job(
+    path: pathlib.Path,
+    files: Mapping[str, pathlib.Path],
+    job: Job,
+    config: Mapping[str, Any],
+    parts: Mapping[str, Sequence[results.EpisodeResult]],
+) -> None:
+  """Checks that a job has its own configuration and all of its own rows.
+
+  Args:
+    path: File of the configuration.
+    files: Files of the rows, by part.
+    job: The job.
+    config: The configuration.
+    parts: The rows, by part.
+
+  Raises:
+    ResultsError: If not. The message names the first difference.
+  """
+  with storage.fitting(path):
+    design, policy = config['design'], config['policy']
+    there = {
+        **{key: config[key] for key in ('run', 'seed', 'baseline', 'twin_of')},
+        **{'design': design['name'], 'channel': design['channel']},
+        'kind': policy or design['learner']['kind'],
+        'is_scripted': policy is not None,
+    }
+    _compare(f'{path}: {job.folder}', there, job.model_dump(exclude={'folder'}))
+    num_episodes, offset = (
+        int(config['evaluation'][key]) for key in ('episodes', 'seed_offset')
+    )
+    runs: dict[str, tuple[str, ...]] = {'rows': (job.run,)}
+    if job.twin_of is not None:
+      runs['transplants'] = (f'{job.twin_of}.{jobs.TRANSPLANT}',)
+    if not job.is_scripted and config['training'].get('tasks'):
+      runs['stages'] = tuple(f'{job.run}.{stage}' for stage in jobs.STAGES)
+    designs = {'transplants': config['embedded']}
+    of_world = {'task': config['task'], 'max_steps': config['max_steps']}
+    _world(config)
+  for part, names in {**dict.fromkeys(parts, ()), **runs}.items():
+    rows = parts.get(part, ())
+    for number, row in enumerate(rows, start=1):
+      place, info = f'{files[part]}:{number}', row.info
+      if info.run not in names:
+        raise errors.ResultsError(
+            f'{place}: a row of run {info.run!r}; must be'
+            f' {" or ".join(map(repr, names)) or "none"}'
+        )
+      with storage.fitting(path):
+        named = designs.get(part, design)
+        expected = {
+            'seed': job.seed + offset, 'policy': job.kind,
+            'design': named['name'], 'channel': named['channel'], **of_world,
+        }  # fmt: skip
+      there = {key: getattr(info, key) for key in expected if key != 'seed'}
+      there |= {'seed': row.seed, 'task': f'{info.domain}.{info.task}'}
+      if part == 'stages':  # Training has other tasks.
+        del there['task'], expected['task']
+      _compare(place, there, expected)
+    keys = sorted((row.info.run, row.world, row.episode) for row in rows)
+    planned = [(name, i, 0) for name in names for i in range(num_episodes)]
+    if keys != sorted(planned):
       raise errors.ResultsError(
-          f'{path}:{number}: a row of run {row.info.run!r}; must be'
-          f' {" or ".join(map(repr, runs))}'
+          f'{files[part]}: {job.folder} has {len(rows)} rows of'
+          f' {len(set(keys))} episodes; must have one of each of the'
+          f' {len(planned)} episodes of {" and ".join(names) or "no run"}'
       )
-  if not rows:
-    raise errors.ResultsError(f'{path}: no rows; at least one is needed')
-  return rows
+
+
+def _compare(place: str, there: Any, here: Any) -> None:
+  """Refuses what is found there if it is not as planned here."""
+  if there != here:
+    raise errors.ResultsError(
+        f'{place}: is of another job: {storage.difference(there, here)}'
+    )
 
 
 def check_stakes(

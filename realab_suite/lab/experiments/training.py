@@ -51,6 +51,8 @@ TRACE = 'trace.bin'
 TRANSPLANT = 'transplant.jsonl'
 # Episodes before adaptation, if there is one.
 STAGES = 'stages.jsonl'
+# What reports read. Times are no results: those of a continued job differ.
+RECORDS = EPISODES, TRANSPLANT, STAGES, CURVE, TRAINING_EPISODES
 _CHECKPOINT = 'checkpoint'
 
 # Called with messages for the user; they do not affect results.
@@ -101,7 +103,7 @@ def run(job: jobs.Job, output: pathlib.Path, options: Options) -> pathlib.Path:
   with storage.locked(path):
     storage.begin(path, job.config())
     config = jobs.read_config(path)  # Refuses another configuration.
-    if (path / storage.DONE).exists():
+    if storage.finished(path, RECORDS):
       options.say(f'{path} has finished already')
       return path
     code = config['versions'].get(storage.CODE, 'unknown')
@@ -136,7 +138,7 @@ def run(job: jobs.Job, output: pathlib.Path, options: Options) -> pathlib.Path:
           ' names, has changed since this job began; restore it, then the same'
           ' command continues the job'
       )
-    storage.finish(path, facts)
+    storage.finish(path, facts, RECORDS)
   options.say(f'Results are in {path}')
   return path
 

@@ -256,6 +256,7 @@ def test_tables_of_different_code_are_refused(tmp_path, code):
       if code is None:
         del row['info']['versions'][storage.CODE]
     path.write_text(''.join(f'{json.dumps(row)}\n' for row in rows))
+    storage.finish(path.parent, {}, training.RECORDS)
 
   change(path)
   publishing.publish(folder, tmp_path / 'published')

@@ -85,7 +85,7 @@ def build(
         (path / training.CURVE).write_text(f'{line}\n{{"step": 60')
         continue
       _write(path, job, rng)
-      storage.finish(path, {})
+      storage.finish(path, {}, training.RECORDS)
   return folder
 
 

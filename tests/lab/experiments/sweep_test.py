@@ -205,6 +205,26 @@ def test_seeds_may_be_added_and_other_changes_are_refused(tmp_path):
     _sweep({**_SMALL, 'max_steps': 10}, tmp_path, engine)
 
 
+@pytest.mark.usefixtures('no_wait')
+def test_a_finished_job_with_other_rows_is_refused_and_not_run_again(tmp_path):
+  _sweep(_SMALL, tmp_path, Pretender())
+  sweep = json.loads((tmp_path / scheduler.SWEEP).read_text())
+  [folder] = [x['folder'] for x in sweep['jobs'] if x['run'] == 'good']
+  (tmp_path / folder / 'episodes.jsonl').write_text('{}\n')
+  engine = Pretender()
+  with pytest.raises(
+      errors.ResultsError,
+      match=r'1 of 2 jobs failed: good, seed 3: .*episodes\.jsonl: has .*; must',
+  ):
+    _sweep(_SMALL, tmp_path, engine)
+  assert not engine.commands
+  for path in tmp_path.glob(f'*/{storage.DONE}'):  # As of a former version.
+    path.write_text('{}')
+  said = _sweep(_SMALL, tmp_path, engine)
+  assert ' '.join(said).count(storage.NO_IMPRINTS) == 1
+  assert not engine.commands
+
+
 def test_one_of_two_parallel_processes_may_fail(tmp_path, monkeypatch):
   monkeypatch.setattr(
       scheduler, '_MODULE', 'tests.lab.experiments.fake_learner'
