@@ -1,6 +1,6 @@
 """A person as feedback provider (paper, section 3.1), and its answers."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 import functools
 import json
 from typing import Annotated, Any, Final, Literal, NamedTuple, final
@@ -22,6 +22,16 @@ KIND: Final = 'person'
 
 APPROVAL, CORRECTION = 'approval', 'correction'
 COMPARISON, STOP = 'comparison', 'stop'
+
+
+def answers(num_actions: int) -> dict[str, Collection[int]]:
+  """Returns the answers to each kind of question."""
+  return {
+      APPROVAL: (-1, 1),
+      COMPARISON: (-1, 1),
+      STOP: (1,),
+      CORRECTION: range(num_actions),
+  }
 
 
 @final
@@ -55,24 +65,34 @@ class Recorded:
   world, the episode and the provider. In other episodes there are none.
   """
 
-  def __init__(self, file: str) -> None:
+  def __init__(self, file: str, num_actions: int) -> None:
     """Reads the answers.
 
     Args:
       file: File of `supervise`: one answer per line, as JSON.
+      num_actions: Number of actions, of which corrections are indices.
 
     Raises:
-      SpecError: If the file is not such a file.
+      SpecError: If the file is not such a file, or an answer is not one of
+        those that a person can give.
     """
+    allowed = answers(num_actions)
     self._answers: dict[tuple[str, int, int], float] = {}
     try:
       with open(file, encoding='utf-8') as lines:
-        for line in lines:
+        for number, line in enumerate(lines, start=1):
           record = json.loads(line)
           first, second = record['key']
           key = str(record['asks']), int(first), int(second)
-          self._answers[key] = float(record['value'])
-    except (OSError, ValueError, KeyError, TypeError) as error:
+          value = record['value']
+          if key in self._answers or value not in allowed[key[0]]:
+            raise ValueError(
+                f'line {number}: {value!r:.40}; allowed is one answer to a'
+                f' question, in {list(allowed[key[0]])}'
+            )
+          self._answers[key] = float(value)
+    except (OSError, ValueError, LookupError, TypeError, ArithmeticError,
+            RecursionError) as error:  # fmt: skip
       raise errors.SpecError(
           f'recorded: {messages.quote(str(file))}: {messages.exception(error)};'
           ' must be a file of answers that supervise has written'
@@ -161,7 +181,8 @@ class Person(base.Provider):
     """Source of the answers."""
     if self.recorded is None:
       return Live()
-    return Recorded(self.recorded)
+    actions = action_sets.ACTION_SETS.get(self.action_set)
+    return Recorded(self.recorded, len(actions))
 
   @property
   def is_repeatable(self) -> bool:

@@ -5,7 +5,7 @@ are logged as a dataset, which the option `recorded` of a design repeats.
 """
 
 from collections import deque
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 import json
 import pathlib
 import time
@@ -67,6 +67,7 @@ class Supervision:
       SpecError: If the design has no such provider, or two that ask the same.
     """
     self._env, self._server = env, server
+    self._allowed = person.answers(len(env.action_set))
     self._folder = folder
     self._period = 1.0 / rate
     design = env.mechanism.design
@@ -281,18 +282,11 @@ class Supervision:
           'type': 'answer',
           'asks': str(asks),
           'value': int(value),
-      } if asks in self._asks and value in self._allowed(asks):
+      } if (
+          asks in self._asks and value in self._allowed[asks]
+      ):
         self._given[asks] = float(value)
     return True
-
-  def _allowed(self, asks: str) -> Collection[int]:
-    """Returns the answers to a kind of question."""
-    return {
-        person.APPROVAL: (-1, 1),
-        person.COMPARISON: (-1, 1),
-        person.STOP: (1,),
-        person.CORRECTION: range(len(self._env.action_set)),
-    }[asks]
 
   def _save(self) -> None:
     """Appends the answers of an episode to the log."""

@@ -12,7 +12,7 @@ import contextlib
 import os
 import pathlib
 import tempfile
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from realab_suite import errors
 from realab_suite.doors.data import recording
 from realab_suite.doors.data import sources
 from realab_suite.doors.data import truth
+from realab_suite.lab.experiments import recorded_data
 from realab_suite.lab.experiments import replays
 from realab_suite.lab.experiments import requirements
 from realab_suite.lab.experiments import storage
@@ -165,6 +166,30 @@ def _new_folder(output: pathlib.Path) -> Iterator[pathlib.Path]:
       os.rename(folder, output)
 
 
+def _write_manifest(
+    folder: pathlib.Path,
+    planned: Sequence[replays.Recorded],
+    episodes: Sequence[truth.Row],
+) -> None:
+  """Writes where the data of the agent are from, for `recorded_data` alone."""
+  origins: list[dict[str, Any]] = []
+  for one in planned:
+    origin = recorded_data.origin(one.world, one.design)
+    if origin not in origins:
+      origins.append(origin)
+  file = recorded_data.FILE
+  num_steps = sum(row['num_steps'] + 1 for row in episodes)
+  content = {
+      'policies': sorted({row['policy'] for row in episodes}),
+      'origins': origins,
+      storage.FILES: {file: storage.imprint(folder / _AGENT / file, num_steps)},
+  }
+  path = folder / recorded_data.MANIFEST
+  storage.write_json(path, content)
+  with storage.explained(path):
+    path.chmod(0o600)  # Agents must not read it.
+
+
 def _written(
     planned: Sequence[replays.Recorded],
     folder: pathlib.Path,
@@ -197,5 +222,7 @@ def _written(
     else:
       for episode_id, agent in enumerate(agents()):
         append(parquet.AGENT_FILE, parquet.agent_table(agent, episode_id))
+  if data_format == 'parquet':
+    _write_manifest(folder, planned, episodes)
   say(f'{len(episodes)} episodes were written')
   return episodes

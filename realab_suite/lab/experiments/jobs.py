@@ -310,7 +310,7 @@ def _variants(
       embedded=None,
       dynamics=_dynamics(experiment),
       experiment=experiment,
-      data=_data(run.data),
+      data=_data(run.data, experiment, experiment.designs[name]),
   )
   variants = [
       dataclasses.replace(
@@ -324,21 +324,28 @@ def _variants(
   ]
   variants.append(learner)
   if run.twin:
+    design = experiment_specs.secure_twin(learner.design)
     twin = dataclasses.replace(
         learner,
         run=f'{name}.{experiment_specs.TWIN}',
-        design=experiment_specs.secure_twin(learner.design),
+        design=design,
         twin_of=name,
         embedded=learner.design,
-        data=_data(run.twin_data),
+        data=_data(run.twin_data, experiment, design),
     )
     variants.append(twin)
   return variants
 
 
-def _data(folder: str | None) -> tuple[str, str] | None:
+def _data(
+    folder: str | None,
+    experiment: experiment_specs.ExperimentSpec,
+    design: specs.DesignSpec,
+) -> tuple[str, str] | None:
   """Returns a folder of recorded episodes and their digest, or `None`."""
-  return None if folder is None else (folder, recorded_data.digest(folder))
+  if folder is None:
+    return None
+  return folder, recorded_data.digest(folder, experiment.world, design)
 
 
 def _dynamics(

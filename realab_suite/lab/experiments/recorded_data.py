@@ -1,11 +1,13 @@
 """Recorded episodes, from which learners are trained without acting.
 
-Only the agent's folder of an export is read, so the truth may be elsewhere.
-`docs/doors.md` describes it.
+Only the agent's folder of an export is read, and the manifest beside it, so the
+truth may be elsewhere. `docs/doors.md` describes them. The manifest says where
+the episodes are from: agents could conclude from it what the truth is, so it is
+outside of their folder.
 """
 
 from collections.abc import Mapping
-import hashlib
+import dataclasses
 import json
 import pathlib
 from typing import TYPE_CHECKING, Any, final
@@ -15,6 +17,7 @@ from dm_env import specs as dm_env_specs
 import numpy as np
 
 from realab_suite import errors
+from realab_suite import worlds
 from realab_suite.engine import batch_environment
 from realab_suite.engine import batch_time_steps
 from realab_suite.engine import environment
@@ -27,6 +30,8 @@ if TYPE_CHECKING:
 
 FILE = 'steps.parquet'
 """Name of the file in the agent's folder of an export."""
+MANIFEST = 'manifest.json'
+"""Name of the file beside that folder, for those who train and judge."""
 
 _Environment = environment.Environment | batch_environment.BatchEnvironment
 _FIRST, _LAST = int(dm_env.StepType.FIRST), int(dm_env.StepType.LAST)
@@ -102,19 +107,22 @@ def load(folder: str, env: _Environment, num_envs: int) -> RecordedBatch:
   """
   if problem := requirements.missing('pyarrow', extra='data'):
     raise errors.ResultsError(f'cannot read recorded episodes: {problem}')
-  import pyarrow as pa
   from pyarrow import parquet
 
   file = _file(folder)
   spec_of = {**env.observation_spec(), 'action': env.action_spec()}
   with storage.explained(file):
     try:
-      table = parquet.read_table(file)
+      table = parquet.read_table(file, partitioning=None)
       _check(file, table.schema, spec_of, env.mechanism.design)
       shapes = {name: spec.shape for name, spec in spec_of.items()}
       shapes |= {'step_type': (), 'discount': ()}
       columns = {k: _values(table.column(k), shapes[k]) for k in shapes}
-    except (pa.ArrowException, KeyError) as error:
+      _check_known(file, table, columns['step_type'])
+      is_finite = {k: np.isfinite(values) for k, values in columns.items()}
+    except errors.RealabError:
+      raise
+    except Exception as error:  # Of pyarrow, or of NumPy on other types.
       text = ' '.join(str(error).split())
       raise errors.ResultsError(
           f'{file}: not the file of an export: {text:.120}'
@@ -124,10 +132,10 @@ def load(folder: str, env: _Environment, num_envs: int) -> RecordedBatch:
       getattr(spec_of['action'], end, value)
       for end, value in (('minimum', -np.inf), ('maximum', np.inf))
   )
-  bounds['discount'] = 0.0, 1.0
+  bounds |= {'discount': (0.0, 1.0), 'step_type': (_FIRST, _LAST)}
   for name, (low, high) in bounds.items():
     values = columns[name]
-    is_fine = np.isfinite(values) & (low <= values) & (values <= high)
+    is_fine = is_finite[name] & (low <= values) & (values <= high)
     if not is_fine.all():
       raise errors.ResultsError(
           f'{file}: column {name!r} holds {values[~is_fine][0]}; must be'
@@ -144,15 +152,54 @@ def load(folder: str, env: _Environment, num_envs: int) -> RecordedBatch:
   return RecordedBatch(columns, env, num_envs)
 
 
-def digest(folder: str) -> str:
+def digest(folder: str, world: worlds.World, design: specs.DesignSpec) -> str:
   """Returns the SHA-256 of the file in a folder, as for `load`.
 
+  Args:
+    folder: Folder `agent` of an export.
+    world: World that the learner will act in.
+    design: Design that it will act in. Only the learner may be another one.
+
   Raises:
-    ResultsError: If the file is missing or cannot be read.
+    ResultsError: If a file is missing, cannot be read or has changed, or the
+      episodes are of another world, length, design or channel.
   """
-  path = _file(folder)
-  with storage.explained(path), open(path, 'rb') as file:
-    return hashlib.file_digest(file, 'sha256').hexdigest()
+  file = _file(folder)
+  path = file.absolute().parent.with_name(MANIFEST)
+  if not path.is_file():
+    raise errors.ResultsError(
+        f'{path}: missing, so nothing tells where {file} is from; export the'
+        ' episodes again'
+    )
+  content = storage.read_json(path)
+  with storage.fitting(path):
+    written, origins = content[storage.FILES][FILE], content['origins']
+    found = storage.imprint(file, written['records']) or {}
+    storage.check_imprint(file, written, found)
+    here = origin(world, design)
+    for there in origins or [{}]:
+      if there != here:
+        raise errors.ResultsError(
+            f'{file}: recorded elsewhere than where its learner is judged:'
+            f' {storage.difference(there, here)}'
+        )
+    return str(found['sha256'])
+
+
+def origin(world: worlds.World, design: specs.DesignSpec) -> dict[str, Any]:
+  """Returns what is equal where episodes are recorded and where they are used.
+
+  Args:
+    world: The world.
+    design: The design. Other learners may use its episodes.
+  """
+  mapping = design.to_mapping()
+  for key in ('name', 'description', 'learner'):
+    mapping.pop(key, None)
+  of_world = {**dataclasses.asdict(world), 'senses': None}  # Columns have them.
+  plain = json.dumps({**of_world, 'channel': design.channel, 'design': mapping})
+  origin_of: dict[str, Any] = json.loads(plain)
+  return origin_of
 
 
 def array_field(name: str, spec: dm_env_specs.Array) -> 'pa.Field':
@@ -205,6 +252,26 @@ def _check(
     if words != allowed:
       raise errors.ResultsError(
           f'{file}: column {name!r}: {words}; with {design.name!r}: {allowed}'
+      )
+
+
+def _check_known(
+    file: pathlib.Path, table: 'pa.Table', step_type: np.ndarray
+) -> None:
+  """Refuses gaps: a missing action or reading would count as 0.
+
+  Raises:
+    ResultsError: If anything is missing but actions after episodes, and
+      discounts and rewards at their starts.
+  """
+  may_lack = {'action': _LAST, 'discount': _FIRST, 'observed_reward': _FIRST}
+  for name in table.column_names:
+    is_known = table.column(name).is_valid().to_numpy()
+    lacks = ~is_known & (step_type != may_lack.get(name, -1))
+    if lacks.any():
+      raise errors.ResultsError(
+          f'{file}: column {name!r} has no value in {lacks.sum()} of'
+          f' {len(lacks)} steps; must have one in each'
       )
 
 

@@ -50,11 +50,48 @@ def test_recorded_answers_repeat_an_episode(tmp_path):
   assert again.registers == live.registers
 
 
-def test_a_file_that_has_no_answers_is_refused(tmp_path):
+_GIVEN = {'asks': 'approval', 'value': 1.0, 'key': [1, 2]}
+
+
+@pytest.mark.parametrize(
+    'content',
+    [
+        b'{"asks": "approval"}',
+        b'{"asks": "approval", "val',
+        b'[1, 2, 3]',
+        b'\xff\xfe',
+        b'[' * 100_000,
+        *(
+            json.dumps({**_GIVEN, **change}).encode()
+            for change in (
+                {'value': 100},
+                {'value': 0.5},
+                {'value': float('nan')},
+                {'value': None},
+                {'value': 10**400},
+                {'asks': 'correction', 'value': 9},
+                {'asks': 'correction', 'value': -1},
+                {'asks': 'stop', 'value': 0},
+                {'asks': 'comparison', 'value': 0},
+                {'asks': 'else'},
+                {'asks': []},
+                {'key': [float('inf'), 1]},
+                {'key': 7},
+            )
+        ),
+        b'\n'.join([json.dumps(_GIVEN).encode()] * 2),
+    ],
+)
+def test_what_no_person_can_answer_is_refused(tmp_path, content):
   file = tmp_path / 'answers.jsonl'
-  file.write_text('{"asks": "approval"}\n')
+  file.write_bytes(content)
+  with pytest.raises(errors.SpecError, match='must be a file of ans') as caught:
+    person.Recorded(str(file), 9)
+  assert '\n' not in str(caught.value)
+  file.unlink()
+  file.mkdir()
   with pytest.raises(errors.SpecError, match='must be a file of answers'):
-    person.Recorded(str(file))
+    person.Recorded(str(file), 9)
 
 
 def test_a_live_source_without_a_person_is_refused():

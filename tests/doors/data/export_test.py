@@ -50,7 +50,7 @@ def test_a_labelled_dataset_has_all_files_and_a_card(folder):
   files = [
       p.relative_to(folder).as_posix() for p in folder.rglob('*') if p.is_file()
   ]
-  inside = ['agent/steps.parquet', *_EVALUATOR]
+  inside = ['agent/steps.parquet', 'manifest.json', *_EVALUATOR]
   assert sorted(files) == sorted(
       [cards.NAME, *(f'instantaneous_reward/{name}' for name in inside)]
   )
@@ -64,7 +64,11 @@ def test_other_users_can_read_the_data_of_the_agent_only(folder):
   group = folder / 'instantaneous_reward'
   modes = {
       path: stat.S_IMODE(path.stat().st_mode)
-      for path in (group / 'evaluator', folder / cards.NAME)
+      for path in (
+          group / 'evaluator',
+          group / 'manifest.json',
+          folder / cards.NAME,
+      )
   }
   assert not [path for path, mode in modes.items() if mode & 0o077]
   umask = os.umask(0)

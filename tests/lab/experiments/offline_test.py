@@ -87,24 +87,29 @@ def fixture_exports(tmp_path_factory):
   """Exports of 8 random episodes of a design and of its secure twin."""
   pytest.importorskip('pyarrow', reason='pyarrow is in the extra `data`')
   from realab_suite.doors.data import export
-  from realab_suite.doors.data import sources
 
   folder = tmp_path_factory.mktemp('exports')
   placed = probes._placed(specs.load(_REWARD), probes.PROBES['one_push'])
   (folder / 'design.json').write_text(json.dumps(placed))
   for channel in ('embedded', 'secure'):
-    source = sources.of_policy(
-        'random',
-        'random',
-        specs.load(placed, (f'channel={channel}',)),
-        worlds.World('probe', 'one_push', probes.NUM_STEPS),
-        seeds=[5],
-        num_episodes=8,
-    )
+    source = _source(folder, (f'channel={channel}',))
     export.export(source, folder / channel)
     # Learners need no more than the agent's folder.
     shutil.rmtree(folder / channel / 'evaluator')
   return folder
+
+
+def _source(folder, overrides=(), *, seeds=(5,), num_steps=probes.NUM_STEPS):
+  from realab_suite.doors.data import sources
+
+  return sources.of_policy(
+      'random',
+      'random',
+      specs.load(str(folder / 'design.json'), overrides),
+      worlds.World('probe', 'one_push', num_steps),
+      seeds=seeds,
+      num_episodes=8,
+  )
 
 
 def _experiment(exports, **run):
@@ -195,12 +200,15 @@ def test_a_job_learns_offline_and_is_judged_like_any_other(
 
 
 def test_other_data_make_another_job(exports, tmp_path):
+  from realab_suite.doors.data import export
+
   before = _planned(exports)
-  moved = tmp_path / 'elsewhere'
-  shutil.copytree(exports / 'embedded/agent', moved)
+  moved = tmp_path / 'elsewhere/agent'
+  shutil.copytree(exports / 'embedded', moved.parent)
   same = _planned(exports, data=str(moved))
   assert same['offline'].folder() == before['offline'].folder()
-  shutil.copy(exports / 'secure/agent/steps.parquet', moved)
+  shutil.rmtree(moved.parent)
+  export.export(_source(exports, seeds=[6]), moved.parent)
   other = _planned(exports, data=str(moved))
   assert other['offline'].folder() != before['offline'].folder()
   for run in ('offline.secure', 'offline.random'):
@@ -240,6 +248,79 @@ def test_data_of_another_design_are_refused_in_a_line(exports, changes, text):
   assert '\n' not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ('run', 'text'),
+    [
+        (
+            {'twin_data': 'embedded'},
+            'channel is .embedded. there, .secure. her',
+        ),
+        ({'data': 'secure'}, 'channel is .secure. there, .embedded. here'),
+        ({'data': 'shorter'}, 'max_steps is 9 there, 10 here'),
+        ({'data': 'scaled'}, r'design\.registers\.reward\.scale is 0\.0'),
+        ({'data': 'world'}, "task is 'two_pushes' there, 'one_push' here"),
+        ({'data': 'edited'}, r'steps\.parquet: has \{.*; must have \{'),
+        ({'data': 'alone'}, r'manifest\.json: missing'),
+        ({'data': 'list'}, r'manifest\.json: damaged'),
+        ({'data': 'empty'}, r'manifest\.json: not JSON'),
+    ],
+)
+def test_data_from_elsewhere_are_refused_before_training(
+    exports, tmp_path, run, text
+):
+  from realab_suite.doors.data import export
+
+  [(key, name)] = run.items()
+  folder = exports / name
+  if not folder.exists():
+    folder = tmp_path / name
+    match name:
+      case 'shorter':
+        source = _source(exports, num_steps=probes.NUM_STEPS - 1)
+        export.export(source, folder)
+      case 'scaled':
+        scale = ('registers.reward.scale=0.09',)
+        export.export(_source(exports, scale), folder)
+      case _:
+        shutil.copytree(exports / 'embedded', folder)
+    manifest = folder / recorded_data.MANIFEST
+    match name:
+      case 'alone':
+        manifest.unlink()
+      case 'list' | 'empty':
+        manifest.write_text('[]' if name == 'list' else '')
+      case 'world':
+        text_of = manifest.read_text()
+        manifest.write_text(text_of.replace('one_push', 'two_pushes'))
+      case 'edited':
+        from pyarrow import parquet
+
+        path = folder / 'agent' / recorded_data.FILE
+        table = _with_reward(parquet.read_table(path), 0.5)
+        parquet.write_table(table, path)
+  with pytest.raises(errors.ResultsError, match=text) as caught:
+    _planned(exports, **{key: str(folder / 'agent')})
+  assert '\n' not in str(caught.value)
+
+
+def _without(table, name):
+  """Returns a table in which all values of a column are missing."""
+  import pyarrow as pa
+
+  index = table.column_names.index(name)
+  array = pa.nulls(len(table), table.column(name).type)
+  field = table.schema.field(index)
+  return table.set_column(index, field.with_nullable(True), array)
+
+
+def _as_text(table, name):
+  """Returns a table in which a column has texts."""
+  import pyarrow as pa
+
+  index = table.column_names.index(name)
+  return table.set_column(index, name, pa.array(['0'] * len(table)))
+
+
 def _with_reward(table, value):
   """Returns a table in which a step of the column of rewards has a value."""
   import pyarrow as pa
@@ -249,7 +330,8 @@ def _with_reward(table, value):
   values = table.column(name).to_pylist()
   values[3] = value
   array = pa.array(values, table.column(name).type)
-  return table.set_column(index, table.schema.field(index), array)
+  field = table.schema.field(index).with_nullable(True)
+  return table.set_column(index, field, array)
 
 
 @pytest.mark.parametrize(
@@ -261,6 +343,17 @@ def _with_reward(table, value):
         (lambda table: table.drop_columns('discount'), 'not the file of an'),
         (lambda table: b'PAR1, but no more', 'not the file of an export: '),
         (lambda table: _with_reward(table, np.nan), "reward' holds nan;"),
+        (lambda table: _with_reward(table, None), 'no value in 1 of 88 steps'),
+        (
+            lambda table: _without(table, 'action'),
+            "'action' has no value in 80",
+        ),
+        (
+            lambda table: _without(table, 'registers/reward'),
+            'in 88 of 88 steps',
+        ),
+        (lambda table: _as_text(table, 'step_type'), 'no value in 8 of 88 st'),
+        (lambda table: _as_text(table, 'discount'), 'not the file of an expo'),
     ],
 )
 def test_damaged_data_are_refused_in_a_line(exports, tmp_path, change, text):
