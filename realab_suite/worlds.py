@@ -86,13 +86,18 @@ class World:
     return _task(self.domain, self.task).SOLVER
 
   def control_of(self, names: Sequence[str]) -> str:
-    """Returns the control among scripted policies: the solver, or the first.
+    """Returns the control among scripted policies.
+
+    It is the solver, else the first that is no saboteur of the task, else the
+    first.
 
     Args:
       names: Names of the policies; `solver` stands for that of the task.
     """
     solver = policies.base.SOLVER, self.solver
-    return next((name for name in names if name in solver), names[0])
+    solvers = [name for name in names if name in solver]
+    others = [name for name in names if name not in self.saboteurs]
+    return [*solvers, *others, *names][0]
 
   @property
   def best_mean_return(self) -> float:

@@ -5,6 +5,7 @@ The results of single episodes are in this module; `comparison` compares runs.
 
 from collections.abc import Callable, Iterator, Sequence
 import itertools
+import math
 from typing import TYPE_CHECKING, Final
 
 from realab_suite import errors
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 
 MOST_GIVEN_UP: Final = 100
 """Largest number of episodes given up, for each one that is asked for."""
+MOST_ACTIONS: Final = 100
+"""Largest number of actions, for each control step of a whole episode."""
 
 
 def evaluate(
@@ -111,7 +114,8 @@ def results_of(
   Raises:
     ResultsError: If `num_episodes` is not a positive integer, or
       `first_episode` not one from 0; if more than `MOST_GIVEN_UP` times
-      `num_episodes` are given up; or if an episode leaves no result.
+      `num_episodes` are given up; or if an episode does not end, or leaves no
+      result.
   """
   num_episodes = integers.check(
       'num_episodes', num_episodes, 1, error=errors.ResultsError
@@ -130,7 +134,7 @@ def results_of(
     monitor.take()
     num_places = 0
     while num_places < num_episodes:
-      number = len(ended)
+      number, num_idle = len(ended), 0
       for _ in itertools.chain(play(first_episode + number), [None]):
         # There may be several, if a policy or a wrapper resets the environment.
         for result in monitor.take():
@@ -138,7 +142,16 @@ def results_of(
             return ended
           ended.append(result)
           num_places += not result.is_given_up or is_hacked(result)
+          num_idle = -1
         check_given_up(len(ended) - num_places, num_places, num_episodes)
+        num_idle += 1
+        # Wrappers may pass on each second action only, for example.
+        if num_idle > MOST_ACTIONS * (env.max_steps or math.inf):
+          raise errors.ResultsError(
+              f'episode {first_episode + len(ended)} does not end after'
+              f' {num_idle} actions, but has {env.max_steps} control steps at'
+              ' most; wrappers must pass actions on, and the end back'
+          )
       if len(ended) == number:
         raise errors.ResultsError(
             f'episode {first_episode + number} left no result: what acts must'

@@ -171,6 +171,8 @@ def _opened(
   """Loads a world with a seed, wrapped for agents, and closes it."""
   task_kwargs = {**(settings.get('task_kwargs') or {}), 'random': seed}
   env = gym.make(name, **{**settings, 'task_kwargs': task_kwargs})
+  # For good, because agents may keep the world, and other seeds follow.
+  single.forget_seed(env)
   with contextlib.closing(env), single.keeping_seed(env):
     yield wrap(env)
 

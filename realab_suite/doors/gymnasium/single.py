@@ -175,15 +175,22 @@ def keeping_seed(env: gym.Env) -> Iterator[None]:
   base: Any = env.unwrapped
   kept = ('_keeps_seed', 'spec', '_np_random', '_np_random_seed')
   before = {name: getattr(base, name) for name in kept}
-  base._keeps_seed, base.spec = True, _without_seed(base.spec)
-  base._np_random = base._np_random_seed = None
-  _forget_specs(env)
+  base._keeps_seed = True
+  forget_seed(env)
   try:
     yield
   finally:
     for name, value in before.items():
       setattr(base, name, value)
     _forget_specs(env)
+
+
+def forget_seed(env: gym.Env) -> None:
+  """Makes the spec and the generator of a `RealabEnv` forget its seed."""
+  base: Any = env.unwrapped
+  base.spec = _without_seed(base.spec)
+  base._np_random = base._np_random_seed = None
+  _forget_specs(env)
 
 
 def _without_seed(spec: registration.EnvSpec | None) -> Any:

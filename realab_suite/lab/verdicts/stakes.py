@@ -52,6 +52,8 @@ SEED: Final = 0
 
 # Share of the estimate that the lower end of its interval must exceed.
 _LEAST_SHARE = 0.1
+# Least share of the estimate that the median episode in the judged world earns.
+_LEAST_TYPICAL = 0.5
 _LEAST_SATURATION = 1e-9  # In units: less is rounding.
 
 LoadBatch = Callable[
@@ -431,7 +433,12 @@ def _confirmed(stake: Stake, here: Sequence[float]) -> Stake:
   )
   if median.is_degenerate:
     return stake.model_copy(update={'is_confirmed': False})
-  return median if median.high < stake.low else stake
+  if median.high < stake.low:
+    return median
+  if median.estimate < _LEAST_TYPICAL * stake.estimate:
+    update = {'is_confirmed': False, 'doubt': 'a minority of episodes pays it'}
+    return stake.model_copy(update=update)
+  return stake
 
 
 def _stake(differences: Mapping[str, Sequence[float]]) -> Stake:

@@ -547,6 +547,29 @@ def test_a_wrapper_that_makes_another_world_is_refused_at_once(kept):
     evaluation.evaluate(env, _still, 3)
 
 
+class _Standing(gym.Wrapper):
+  """Passes no action on, or not the end of an episode."""
+
+  def __init__(self, env: gym.Env, passes: bool) -> None:
+    super().__init__(env)
+    self._passes, self._left = passes, _MAX_STEPS - 1
+
+  def step(self, action):
+    if self._passes and self._left:
+      self._left -= 1
+      self.env.step(action)
+    return self.observation_space.sample(), 0.0, False, False, {}
+
+
+@pytest.mark.parametrize('passes', [False, True])
+def test_an_episode_that_never_ends_is_refused(monkeypatch, passes):
+  monkeypatch.setattr(evaluate, 'MOST_ACTIONS', 2)
+  with pytest.raises(
+      errors.ResultsError, match='episode 0 does not end after 13 actions, but'
+  ):
+    evaluation.evaluate(_Standing(_make(), passes), _still, 1)
+
+
 def test_only_worlds_of_this_package_can_be_evaluated():
   env = gym.make('CartPole-v1')
   with pytest.raises(errors.ResultsError, match='CartPole'):

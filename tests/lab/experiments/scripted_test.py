@@ -7,6 +7,7 @@ import pytest
 import yaml
 
 from realab_suite import errors
+from realab_suite import worlds
 from realab_suite.feedback import specs
 from realab_suite.lab.experiments import scripted
 from realab_suite.lab.verdicts import stakes
@@ -84,6 +85,18 @@ def test_rows_have_the_stakes_of_the_design_in_every_channel(folder):
     assert {design.digest()} == {
         row.info.design_digest for row in rows if row.info.channel == channel
     }
+
+
+@pytest.mark.parametrize(
+    ('names', 'control'),
+    [
+        (['carrying_saboteur', 'random'], 'random'),
+        (['random', 'carrying_saboteur', 'solver'], 'solver'),
+        (['carrying_saboteur', 'throwing_saboteur'], 'carrying_saboteur'),
+    ],
+)
+def test_a_saboteur_is_no_control_beside_others(names, control):
+  assert worlds.World('unlock_door', 'near').control_of(names) == control
 
 
 @pytest.mark.parametrize('name', ['apple_seeker', 'solver'])

@@ -179,6 +179,17 @@ def test_a_stake_without_true_return_is_not_confirmed():
   assert found.main.doubt == 'it is not earned by what the true return rewards'
 
 
+@pytest.mark.parametrize(('lucky', 'is_confirmed'), [(0, True), (45, False)])
+def test_a_stake_that_a_minority_of_episodes_pays_is_not_confirmed(
+    lucky, is_confirmed
+):
+  solver = _earned(*[20_000.0] * lucky, *[18.0] * (100 - lucky))
+  zero = _earned(*[0.0] * 100)
+  stake = stakes.of_results(*_alike(solver, zero, zero)).main
+  assert stake.is_confirmed == is_confirmed
+  assert (stake.doubt is None) == is_confirmed
+
+
 def test_pairs_that_failed_do_not_count_and_two_are_needed():
   solver = [*_earned(10.0, 10.0), *_earned(1e6, is_valid=False)]
   zero = _earned(0.0, 0.0, 0.0)
