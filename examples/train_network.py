@@ -10,14 +10,13 @@ extra `agents`.
 """
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 import contextlib
 import dataclasses
 import pathlib
 from typing import Any
 
 from dm_env import specs as dm_env_specs
-import numpy as np
 import tqdm
 
 from realab_suite import worlds
@@ -30,10 +29,10 @@ from realab_suite.feedback import specs
 from realab_suite.lab.agents import action_encoding
 from realab_suite.lab.agents import base
 from realab_suite.lab.agents import features
+from realab_suite.lab.agents import network_export
 from realab_suite.lab.experiments import jobs
 from realab_suite.lab.verdicts import comparison
 from realab_suite.lab.verdicts import intervals
-from realab_suite.policies import action_sets
 from realab_suite.policies import network_files
 from realab_suite.policies import network_policies
 
@@ -61,8 +60,6 @@ LEARNER: Mapping[str, Any] = {
     'gamma': 0.998,
     'hidden': [64, 64],
 }
-# Path of the layers in the trained parameters of the learner.
-_PART = '[0].policy.network'
 STEPS = 2_000_000
 
 
@@ -80,27 +77,10 @@ def make(
     num_envs: Number of worlds for training.
     num_episodes: Number of evaluation episodes of each task.
   """
-  seen, trained = _train(learner, steps, num_envs)
-  prefix = f'{_PART}.layers'
-  num_layers = sum(
-      name.startswith(prefix) and name.endswith('.weight') for name in trained
-  )
-  weights, biases = (
-      tuple(
-          np.asarray(trained[f'{prefix}[{i}].{what}'], np.float32)
-          for i in range(num_layers)
-      )
-      for what in ('weight', 'bias')
-  )
   design = specs.load(_DESIGN, _OVERRIDES)
-  actions = action_sets.DMLAB_LIKE
-  header = network_files.Header(
-      outputs='log_probabilities',
+  network = network_export.export(
+      _train(learner, steps, num_envs),
       description=DESCRIPTION,
-      action_set=actions.name,
-      action_set_version=actions.version,
-      features=seen,
-      hidden=tuple(weight.shape[1] for weight in weights[:-1]),
       made=dict(
           learner=dict(learner),
           task=f'{_DOMAIN}.{_VARIATION}',
@@ -114,18 +94,17 @@ def make(
       ),
       reached=(),
   )
-  network = network_files.Network(header, weights, biases)
   reached = tuple(
       _evaluate(network, task, num_episodes) for task in _EVALUATION_TASKS
   )
-  header = header.model_copy(update={'reached': reached})
+  header = network.header.model_copy(update={'reached': reached})
   return dataclasses.replace(network, header=header)
 
 
 def _train(
     options: Mapping[str, Any], steps: int, num_envs: int
-) -> tuple[tuple[network_files.Feature, ...], dict[str, Any]]:
-  """Returns the inputs of a trained learner, and its parameters by path."""
+) -> base.Learner:
+  """Returns a trained learner."""
   learner_class = base.LEARNERS.get(options['kind'])
   checked = validation.validate(learner_class.OPTIONS, options, 'learner')
   world = worlds.World(_DOMAIN, _VARIATION)
@@ -155,12 +134,7 @@ def _train(
       while learner.num_steps < steps:
         time_step = batch.step(learner.step(time_step))
         bar.update(num_envs)
-  names = network_files.Feature.model_fields
-  seen = tuple(
-      network_files.Feature(**{name: getattr(part, name) for name in names})
-      for part in encoder.entries
-  )
-  return seen, learner.state()['trained']
+  return learner
 
 
 def _without_gaps(spec: dm_env_specs.Array) -> dm_env_specs.Array:
@@ -184,19 +158,26 @@ def _evaluate(
   ) as batch:
     actor = batch_actors.BatchPolicyActor(policy, batch, _EVALUATION_SEED)
     found = evaluate.evaluate_batch(batch, actor)
+  return summary(f'{_DOMAIN}.{variation}', found, _EVALUATION_SEED)
+
+
+def summary(
+    task: str, found: Iterable[results.EpisodeResult], seed: int
+) -> dict[str, Any]:
+  """Returns the mean true return of episodes, for the header of a file."""
   episodes = [episode for episode in found if episode.is_valid]
   interval = intervals.mean_interval(
-      {_EVALUATION_SEED: [episode.true_return for episode in episodes]},
+      {seed: [episode.true_return for episode in episodes]},
       bounds=comparison.return_bounds(episodes),
   )
   return dict(
-      task=f'{_DOMAIN}.{variation}',
+      task=task,
       mean=interval.estimate,
       low=interval.low,
       high=interval.high,
       level=interval.level,
       episodes=len(episodes),
-      seed=_EVALUATION_SEED,
+      seed=seed,
   )
 
 

@@ -38,7 +38,7 @@ class Feature(validation.Model):
 
   Attributes:
     name: Key in the observation.
-    kind: Kind of the encoding.
+    kind: Kind of the encoding; a reading of a register becomes its arcsinh.
     shape: Shape in one world.
     low: Lowest value, if the part is bounded.
     high: Highest value, if the part is bounded.
@@ -46,7 +46,7 @@ class Feature(validation.Model):
   """
 
   name: str
-  kind: Literal['plain', 'scaled', 'one_hot', 'rays']
+  kind: Literal['plain', 'scaled', 'reading', 'one_hot', 'rays']
   shape: _Sizes
   low: _Finite = 0.0
   high: _Finite = 0.0
@@ -54,7 +54,8 @@ class Feature(validation.Model):
 
   @pydantic.model_validator(mode='after')
   def _bounded(self) -> 'Feature':
-    if self.kind != 'plain' and not 0 < self.high - self.low <= 2**10:
+    is_bounded = self.kind not in ('plain', 'reading')
+    if is_bounded and not 0 < self.high - self.low <= 2**10:
       raise ValueError(f'low {self.low:g} and high {self.high:g} do not fit')
     if (self.kind == 'rays') != bool(self.partner):
       raise ValueError('partner: required for rays, and only for them')
@@ -83,8 +84,9 @@ class Header(validation.Model):
     hidden: Widths of the hidden layers.
     made: Record of the training, as plain data: the learner, the task, the
       design, the steps, the seed and the versions of packages.
-    reached: True returns of the policy that takes the best action, as plain
-      data: the task, the mean with its interval, and the episodes.
+    reached: True returns of the policy, as plain data: the task, the mean with
+      its interval, and the episodes. It takes the best action, unless `actions`
+      in `made` is 'sampled'.
   """
 
   format: Literal[1] = 1

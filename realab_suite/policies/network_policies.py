@@ -16,6 +16,7 @@ from realab_suite.config import option_types
 from realab_suite.policies import action_sets
 from realab_suite.policies import base
 from realab_suite.policies import network_files
+from realab_suite.policies import random_keys
 
 # Distance at which the feature of a ray's hit falls to 1 / e, metres.
 _RAY_SCALE = 2.0
@@ -76,6 +77,29 @@ class NetworkDemonstrator(_NetworkReader, base.Policy):
     del key
     values = outputs(self._network, observation, np.shape(episode_start))
     return np.asarray(values.argmax(axis=-1)), state
+
+
+@final
+class NetworkAgent(_NetworkReader, base.Policy):
+  """Draws actions with the probabilities of a network, as learners do.
+
+  It has no name in the registry, because its inputs may include readings of
+  registers, which no supervisor gets.
+  """
+
+  def step(
+      self,
+      observation: base.Observation,
+      episode_start: np.ndarray,
+      key: np.ndarray,
+      state: Any,
+  ) -> tuple[np.ndarray, Any]:
+    values = outputs(self._network, observation, np.shape(episode_start))
+    weights = np.exp(values - values.max(axis=-1, keepdims=True), dtype=float)
+    sums = weights.cumsum(axis=-1)
+    draws = random_keys.uniform(key)[..., np.newaxis] * sums[..., -1:]
+    # Rounded, a draw may be the whole sum; the last action is then taken.
+    return (draws >= sums[..., :-1]).sum(axis=-1), state
 
 
 @base.VALUE_FUNCTIONS.add('network_values')
@@ -173,7 +197,7 @@ def _show(
   value = _take(observation, feature.name, shape, np.float32)
   if feature.kind == 'scaled':
     return 2.0 * (value - feature.low) / (feature.high - feature.low) - 1.0
-  return value
+  return np.arcsinh(value) if feature.kind == 'reading' else value
 
 
 def _take(

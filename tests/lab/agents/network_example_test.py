@@ -1,11 +1,14 @@
-"""Tests of the example that trains the shipped network."""
+"""Tests of the examples that train the shipped networks."""
 
 import importlib
 import pathlib
 
 import pytest
 
+from realab_suite.lab.experiments import experiment_specs
+from realab_suite.lab.experiments import jobs
 from realab_suite.policies import network_files
+from realab_suite.policies import trained
 
 _EXAMPLES = pathlib.Path(__file__).parents[3] / 'examples'
 
@@ -36,3 +39,20 @@ def test_a_made_network_can_be_loaded(example):
   seen = {feature.name for feature in net.header.features}
   assert {'senses/ray_classes', 'senses/velocity'} <= seen
   assert not any(name.startswith('registers/') for name in seen)
+
+
+@pytest.mark.parametrize('name', trained.TRAINED)
+def test_the_trained_agents_are_those_of_their_example(monkeypatch, name):
+  monkeypatch.syspath_prepend(str(_EXAMPLES))
+  example = importlib.import_module('train_policies')
+  run, description = example.AGENTS[name]
+  experiment = experiment_specs.load(example.EXPERIMENT)
+  [job] = jobs.plan(experiment, [example.SEED], [run])
+  header = trained.load(name).header
+  assert header.description == description
+  assert header.made['design_digest'] == job.design.digest()
+  assert header.made['training'] == job.training.to_mapping()
+  assert header.made['seed'] == example.SEED
+  [reached] = header.reached
+  assert reached['task'] == experiment.task
+  assert reached['episodes'] == experiment.evaluation.episodes

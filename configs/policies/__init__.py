@@ -1,0 +1,1 @@
+"""Data only: trained agents, of `examples/train_policies.py`."""
