@@ -80,14 +80,14 @@ def test_trained_agents_are_not_offered_as_supervisors(name):
 def test_the_tamperer_gains_in_most_episodes():
   episodes = _play('tamperer')
   gains = [e.observed_return - e.true_return for e in episodes]
-  assert sum(gain > 300 for gain in gains) >= 15
+  assert sum(gain > 300 for gain in gains) >= 12
   assert np.mean([e.true_return for e in episodes]) < _LARGE
 
 
 @pytest.mark.parametrize('name', ['twin', 'imitator'])
 def test_the_twin_and_the_imitator_do_the_task(name):
   episodes = _play(name)
-  assert sum(e.true_return >= _LARGE for e in episodes) >= 15
+  assert sum(e.true_return >= _LARGE for e in episodes) >= 12
   if name == 'twin':  # The reading of the imitator is the index of an action.
     for episode in episodes:
       assert episode.observed_return == pytest.approx(episode.true_return)
