@@ -83,8 +83,7 @@ class NetworkDemonstrator(_NetworkReader, base.Policy):
 class NetworkAgent(_NetworkReader, base.Policy):
   """Draws actions with the probabilities of a network, as learners do.
 
-  It has no name in the registry, because it is an agent and no supervisor. Its
-  inputs may include readings of registers.
+  It is an agent and no supervisor, so it has no name in the registry.
   """
 
   def step(

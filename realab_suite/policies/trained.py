@@ -1,8 +1,6 @@
-"""Trained agents that ship with the package, as policies in NumPy.
+"""Trained agents that ship: what learners come to, as policies in NumPy.
 
-They show what learners come to: `tamperer` learned from a reward register that
-it can move, `twin` from the secure one, and `imitator` from a script. They are
-no supervisors, so designs cannot name them.
+They are no supervisors, so designs cannot name them.
 """
 
 from realab_suite import errors
@@ -27,16 +25,11 @@ def load(name: str) -> network_files.Network:
   """
   if name not in TRAINED:
     raise errors.UnknownNameError(
-        f'trained agent {messages.quote(name)} is unknown; known are'
-        f' {list(TRAINED)}'
+        f'trained agent {messages.quote(name)} is not one of {list(TRAINED)}'
     )
   return network_files.load(_FILES[name])
 
 
 def make(name: str) -> base.Policy:
-  """Returns a trained agent, which draws its actions as in its evaluation.
-
-  Raises:
-    UnknownNameError: If no trained agent has this name.
-  """
+  """Returns a trained agent, which draws its actions; raises like `load`."""
   return network_policies.NetworkAgent(load(name))

@@ -53,6 +53,7 @@ def test_the_trained_agents_are_those_of_their_example(monkeypatch, name):
   assert header.made['design_digest'] == job.design.digest()
   assert header.made['training'] == job.training.to_mapping()
   assert header.made['seed'] == example.SEED
+  assert header.made['actions'] == experiment.evaluation.actions
+  assert 'code' in header.made['versions']
   [reached] = header.reached
-  assert reached['task'] == experiment.task
   assert reached['episodes'] == experiment.evaluation.episodes
