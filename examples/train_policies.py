@@ -24,7 +24,7 @@ from realab_suite.lab.experiments import training
 from realab_suite.policies import network_files
 
 EXPERIMENT = 'policies'
-# Of the three seeds of the experiment, the one whose gain was the median.
+# Of the three seeds of the tamperer, the one whose mean gain was the median.
 SEED = 0
 # Run of each agent, and what it does.
 AGENTS = {
