@@ -268,14 +268,13 @@ def test_each_run_has_its_task_and_the_solver_of_it():
 
 
 @pytest.mark.parametrize('name', ['solver', 'apple_seeker', 'no_op'])
-def test_the_solver_is_the_baseline_to_compare_with(name):
+def test_the_solver_or_no_saboteur_is_the_baseline_to_compare_with(name):
   experiment = experiment_specs.load(
       {**_SMALL, 'baselines': ['carrying_saboteur', name, 'random']}
   )
   planned = {job.run: job.baseline for job in jobs.plan(experiment)}
-  control = 'carrying_saboteur' if name == 'no_op' else name
-  assert {of for of in planned.values() if of} == {f'reward.{control}'}
-  assert planned[f'reward.{control}'] is None
+  assert {of for of in planned.values() if of} == {f'reward.{name}'}
+  assert planned[f'reward.{name}'] is None
 
 
 def test_a_solver_of_a_task_without_one_is_refused(monkeypatch):
