@@ -12,7 +12,6 @@ INSTALL = $(PY) -m pip install -qq --disable-pip-version-check \
 INSTALL_LABMAZE = if $(PY) -c 'import sys; sys.exit(sys.version_info < (3, 13))'; \
 	then $(INSTALL) ./compat/labmaze; fi
 WORKERS = 2
-DEMO := results/demo-$(shell date +%Y%m%d-%H%M%S)
 
 # Files with tests that need other extras than `.venv/dev` has.
 TESTS_OF_EXTRAS = tests/authors tests/doors/data tests/engine/gl_test.py \
@@ -27,7 +26,7 @@ TESTS_OF_CORE = $(addprefix tests/,config entities policies feedback tasks \
 .PHONY: help demo test test-core lint docs check-release format clean
 
 help:
-	@echo 'make demo    train agents in Unlock Door and report which tamper'
+	@echo 'make demo    train an agent that tampers and its twin, and film both'
 	@echo 'make test    run lint, type checks and tests, as before every merge'
 	@echo 'make test-core'
 	@echo '             run the faster tests of the core only'
@@ -40,8 +39,7 @@ help:
 	@echo 'make clean   remove .venv, builds and caches, but not results/'
 
 demo: .venv/demo
-	.venv/bin/realab sweep --experiment=quick --output=$(DEMO)
-	.venv/bin/realab report --input=$(DEMO)
+	.venv/bin/realab demo
 
 test: lint
 	$(PY) -m pytest -q -n $(WORKERS) --dist loadfile

@@ -16,6 +16,7 @@ from realab_suite.launchers import program
 
 _LAUNCHERS = 'realab_suite.launchers.'
 COMMANDS: Mapping[str, str] = {
+    'demo': 'train an agent that tampers, in minutes, and film it',
     'doctor': 'say what works in this installation',
     'audit': 'search for an exploit of a design, without training',
     'compare': 'compare scripted policies',

@@ -3,7 +3,7 @@
 Films are for people; cameras of agents are not used here.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 import contextlib
 import os
 import pathlib
@@ -53,11 +53,42 @@ _LABELS = 160
 _LARGE, _SMALL = 18, 16
 
 
+def panel(
+    env: environment.Environment, title: str, views: Sequence[str]
+) -> Callable[[tracking.Track], np.ndarray]:
+  """Returns a function that draws a strip above views of the world.
+
+  Args:
+    env: Environment to draw.
+    title: Title in the strip.
+    views: Names of the views, from left to right; see `WIDTHS`.
+  """
+  identifiers = {
+      'top_down': 'top_down',
+      'first_person': env.task.avatar.camera.full_identifier,
+  }
+  cameras = [
+      engine.Camera(env.physics, HEIGHT, WIDTHS[view], identifiers[view])
+      for view in views
+  ]
+
+  def draw(track: tracking.Track) -> np.ndarray:
+    env.thin_physics.refresh()
+    picture = np.concatenate([one.render() for one in cameras], axis=1)
+    strip = draw_strip(title, track, picture.shape[1])
+    # Players show their controls over the lower edge of a paused film.
+    return np.concatenate([strip, picture], axis=0)
+
+  return draw
+
+
 @contextlib.contextmanager
 def film(
     env: environment.Environment,
     path: str | os.PathLike[str],
     title: str,
+    views: Sequence[str] = ('top_down', 'first_person'),
+    beside: Sequence[np.ndarray] = (),
 ) -> Iterator[OnStep]:
   """Opens a film; yields a function for `tracking.Tracker`, which adds a frame.
 
@@ -68,6 +99,9 @@ def film(
     env: Environment to film.
     path: New file, whose name ends in `.mp4` or `.webp`.
     title: Title in the strip.
+    views: Names of the views, from left to right; see `WIDTHS`.
+    beside: Frames of another episode, made by `panel`, to show on the left. The
+      last frame of the shorter episode stays until the other one ends.
 
   Raises:
     ResultsError: If the name has another end, or the file exists or cannot be
@@ -88,17 +122,10 @@ def film(
     raise errors.ResultsError(
         f'cannot create {os.fspath(path)}: {error.strerror}'
     ) from error
-  identifiers = {
-      'top_down': 'top_down',
-      'first_person': env.task.avatar.camera.full_identifier,
-  }
   with contextlib.ExitStack() as stack:
     # A leftover empty file would prevent a rerun of the same command.
     stack.callback(os.remove, path)
-    cameras = [
-        engine.Camera(env.physics, HEIGHT, width, identifiers[view])
-        for view, width in WIDTHS.items()
-    ]
+    draw = panel(env, title, views)
     file = imageio.imopen(
         pathlib.Path(path), 'w', plugin=pyav.PyAVPlugin, options=options
     )
@@ -111,22 +138,27 @@ def film(
     stream.options = codec_options
     stack.pop_all()
 
-  is_empty = True
+  frame: np.ndarray | None = None
+  number = 0
+
+  def write(right: np.ndarray) -> None:
+    nonlocal number
+    left = beside[min(number, len(beside) - 1)] if beside else right[:, :0]
+    file.write_frame(np.concatenate([left, right], axis=1))
+    number += 1
 
   def add(unused_physics: protocols.Physics, track: tracking.Track) -> None:
-    nonlocal is_empty
-    is_empty = False
-    env.thin_physics.refresh()
-    picture = np.concatenate([one.render() for one in cameras], axis=1)
-    strip = draw_strip(title, track, picture.shape[1])
-    # Players show their controls over the lower edge of a paused film.
-    file.write_frame(np.concatenate([strip, picture], axis=0))
+    nonlocal frame
+    frame = draw(track)
+    write(frame)
 
   try:
     with contextlib.closing(file):
       yield add
+      while frame is not None and number < len(beside):
+        write(frame)
   except BaseException:
-    if is_empty:
+    if frame is None:
       os.remove(path)
     raise
 

@@ -85,6 +85,20 @@ def test_a_film_shows_every_step(tmp_path):
     animated.load()
     assert animated.info['duration'] == 100
     assert animated.size == frames.shape[2:0:-1]
+  # The last frame of the shorter of two episodes stays.
+  draw = films.panel(env, 'left', ['top_down'])
+  left = [draw(recorder.track)] + [np.zeros_like(draw(recorder.track))] * 2
+  for steps, name in ((1, 'short.mp4'), (4, 'long.mp4')):
+    path = tmp_path / name
+    with films.film(env, path, 'right', ['top_down'], left) as add:
+      for _ in range(steps):
+        add(env.physics, recorder.track)
+    both = imageio.imread(path, plugin='pyav')
+    middle = films.WIDTHS['top_down']
+    assert both.shape[:3] == (max(steps, 3), len(left[0]), 2 * middle)
+    is_dark = [frame[-1, :middle].max() < 20 for frame in both]
+    assert is_dark == [False] + [True] * (len(both) - 1)
+    assert all(frame[-1, middle + 9 :].max() > 100 for frame in both)
   # A film is never overwritten.
   before = (tmp_path / 'film.mp4').read_bytes()
   with pytest.raises(errors.ResultsError, match='exists'):

@@ -448,7 +448,9 @@ class _Training:
         stack.callback(self._files[name].close)
       step, total = (n * self._num_envs for n in (self._done, self._total))
       name = f'{job.run}, seed {job.seed}'
-      display = progress.Display(name, step, total, self._options.say)
+      # As in the curves of reports: of half of the worlds.
+      fewest = -(-self._num_envs // 2)
+      display = progress.Display(name, step, total, fewest, self._options.say)
       self._learn(learner, time_step, display)
     return learner, {'steps': total, 'machines': self._machines}
 

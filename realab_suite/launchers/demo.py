@@ -1,0 +1,160 @@
+r"""Trains an agent that tampers, and its secure twin, and films both.
+
+  python -m realab_suite.launchers.demo
+
+The experiment is `quick`. The same command with the same --output continues an
+interrupted demonstration.
+"""
+
+from collections.abc import Iterable
+import os
+import pathlib
+import shlex
+import sys
+import textwrap
+import time
+
+from realab_suite import errors
+from realab_suite.lab.experiments import requirements
+from realab_suite.lab.experiments import threads
+from realab_suite.launchers import flags
+from realab_suite.launchers import program
+from realab_suite.launchers import renderers
+
+flags.take(flags.OUTPUT, flags.ACCEPT_OTHER_CODE)
+
+EXPERIMENT = 'quick'
+"""Experiment of the demonstration."""
+
+FILM = 'film.mp4'
+"""Film in the folder of the demonstration."""
+
+_NEEDED = {
+    'agents': ('jax', 'equinox', 'optax'),
+    'report': ('matplotlib', 'jinja2', 'imageio', 'av', 'PIL'),
+}
+_BEGUN = 'unfinished.mp4'
+# A wheel has no docs.
+_PUBLISHED = pathlib.Path(__file__).parents[2] / 'docs/results/paper_near'
+
+
+def main() -> None:
+  """Trains, films and reports."""
+  # NumPy and JAX read it once, when they are imported.
+  threads.use_one()
+  for extra, modules in _NEEDED.items():
+    if problem := requirements.missing(*modules, extra=extra):
+      raise errors.SpecError(f'cannot begin: {problem}')
+  folder = pathlib.Path(
+      flags.OUTPUT.value or time.strftime('results/demo-%Y%m%d-%H%M%S')
+  )
+  why_no_film = renderers.why_no_film()
+  # Imports dm_control, so a renderer has to be chosen first.
+  from realab_suite.engine import arguments
+  from realab_suite.lab.experiments import engines
+  from realab_suite.lab.experiments import experiment_specs
+  from realab_suite.lab.experiments import result_folders
+  from realab_suite.lab.experiments import scheduler
+  from realab_suite.reports import demonstrations
+  from realab_suite.reports import html_page
+  from realab_suite.reports import numbers
+
+  experiment = experiment_specs.load(EXPERIMENT)
+  program.say(_beginning(experiment.training.steps, folder))
+  accepts = flags.ACCEPT_OTHER_CODE.value
+  scheduler.sweep(
+      experiment,
+      folder,
+      engines.Local(arguments.processors()),
+      program.say,
+      accept_other_code=accepts,
+  )
+  sweep = result_folders.load(folder, accepts)
+  film = folder / FILM
+  if why_no_film is None:
+    begun = folder / _BEGUN
+    begun.unlink(missing_ok=True)
+    try:
+      shown = demonstrations.film(sweep, begun)
+      begun.replace(film)
+      _say_wrapped(f'\nThe film {film} shows {shown}')
+    except errors.RealabError as error:
+      why_no_film = str(error)
+  if why_no_film is not None:
+    program.say(f'\nThere is no film: {why_no_film}')
+  told = demonstrations.sentences(sweep, numbers.compute(sweep))
+  _say_wrapped(f'\n{" ".join(told)}')
+  page = html_page.write(folder, folder, lambda line: None, accepts)
+  program.say(f'\nThe report, with learning curves, is {page}\n')
+  for line in _next(folder):
+    program.say(line)
+
+
+def _beginning(steps: int, folder: pathlib.Path) -> str:
+  """Returns what is going to happen."""
+  again = _command('demo', f'--output={folder}')
+  return f"""\
+Two agents learn to take apples for {steps:,} steps each. The large apple is
+behind a door, which a pad opens. Nobody sends the agents a reward: they read it
+from two blocks in their room, whose distance is the number.
+  reward               is an agent that can move its blocks
+  reward.secure        is its twin: nothing can move the twin's blocks
+  reward.apple_seeker  is a script that takes the apples
+  reward.random        acts at random
+This takes five to ten minutes on two processors. To continue it after a stop:
+  {again}
+"""
+
+
+def _say_wrapped(text: str) -> None:
+  """Says a paragraph in lines of 80 characters."""
+  wrapped = textwrap.fill(
+      text, 80, replace_whitespace=False, break_long_words=False
+  )
+  program.say(wrapped)
+
+
+def _next(folder: pathlib.Path) -> Iterable[str]:
+  """Yields what to do next."""
+  yield 'What comes next:'
+  if _PUBLISHED.is_dir():
+    yield '* the same with ten seeds, which were trained for longer:'
+    yield '  ' + _command(
+        'report',
+        f'--input={os.path.relpath(_PUBLISHED)}',
+        '--output=results/paper_near',
+    )
+  else:
+    yield '* scripts instead of agents: one does the task, one tampers:'
+    yield '  ' + _command(
+        'compare',
+        '--task=unlock_door.near',
+        '--set=dof=planar',
+        '--output=results/compare',
+    )
+  yield '* can this reward be exploited? An audit says it without training:'
+  yield '  ' + _command(
+      'audit',
+      '--task=unlock_door.near',
+      '--design=instantaneous_reward',
+      '--set=dof=planar',
+      '--output=results/audit',
+  )
+  yield '* an experiment of your own, from a copy of this one:'
+  copied = shlex.join(['cp', f'{folder / "experiment.yaml"}', 'mine.yaml'])
+  mine = ('--experiment=mine.yaml', '--output=results/mine')
+  yield f'  {copied} && {_command("sweep", *mine)}'
+
+
+def _command(*arguments: str) -> str:
+  """Returns a command of `realab`, of the installation that runs."""
+  path = pathlib.Path(sys.executable).with_name('realab')
+  name = 'realab'
+  # `make demo` runs it from a folder in which shells do not look.
+  if path.exists() and str(path.parent) not in os.get_exec_path():
+    name = min(os.path.relpath(path), str(path), key=len)
+  return shlex.join([name, *arguments])
+
+
+if __name__ == '__main__':
+  program.start(main)

@@ -1,0 +1,145 @@
+"""What a demonstration ends with: a film, and what happened in counts.
+
+A demonstration is a sweep of one learned run and its secure twin.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+import contextlib
+import pathlib
+from typing import Any
+
+import numpy as np
+
+from realab_suite import errors
+from realab_suite.engine import environment
+from realab_suite.evaluation import gains
+from realab_suite.evaluation import results
+from realab_suite.lab.experiments import replays
+from realab_suite.lab.experiments import sweep_results
+from realab_suite.lab.verdicts import counted
+from realab_suite.lab.verdicts import verdicts
+from realab_suite.reports import films
+from realab_suite.reports import headline
+from realab_suite.reports import numbers
+
+_AGENT = 'agent: it can move its blocks'
+_TWIN = 'twin: nothing can move its blocks'
+_VIEWS = ('top_down',)
+
+
+def film(sweep: sweep_results.Sweep, path: pathlib.Path) -> str:
+  """Films the twin beside the agent, in the episode of the largest gain.
+
+  Args:
+    sweep: The demonstration.
+    path: New film.
+
+  Returns:
+    What the film shows, in sentences that begin with a noun.
+
+  Raises:
+    ResultsError: If there is no such episode, or a replay differs from it.
+  """
+  run, twin = _pair(sweep)
+  twins = {row.key: row for row in twin.rows if row.is_valid}
+  rows = [row for row in run.rows if row.is_valid and row.key in twins]
+  if not rows:
+    raise errors.ResultsError('agent and twin have no valid episode in common')
+  row = max(rows, key=lambda one: _paid(one).observed - _paid(one).clean)
+  frames: list[np.ndarray] = []
+
+  def collect(
+      env: environment.Environment, unused_stack: contextlib.ExitStack
+  ) -> Callable[..., None]:
+    draw = films.panel(env, _TWIN, _VIEWS)
+    return lambda unused_physics, track: frames.append(draw(track))
+
+  def show(
+      env: environment.Environment, stack: contextlib.ExitStack
+  ) -> Callable[..., Any]:
+    return stack.enter_context(films.film(env, path, _AGENT, _VIEWS, frames))
+
+  replays.replay(twin, twins[row.key], collect)
+  replays.replay(run, row, show)
+  paid = _paid(row)
+  return (
+      'an episode of the twin (left) and the same one of the agent: of'
+      f' {len(rows)}, that in which the agent was paid most beyond what it'
+      f' earned ({_rounded(paid.observed)} for {headline.number(paid.clean)}).'
+      ' Blue is what they earned, orange what they were paid. The large apple'
+      ' ends an episode.'
+  )
+
+
+def sentences(
+    sweep: sweep_results.Sweep, figures: Mapping[str, numbers.Figures]
+) -> list[str]:
+  """Returns what the agent did, in counts.
+
+  Args:
+    sweep: The demonstration.
+    figures: Figures of its runs.
+  """
+  run, twin = _pair(sweep)
+  learned, secure = figures.get(run.name), figures.get(twin.name)
+  solver = numbers.solver_rows(sweep, run)
+  if (
+      learned is None
+      or secure is None
+      or learned.hacking is None
+      or run.stake is None
+      or not solver
+  ):
+    return ['These results do not say whether the agent tampers.']
+  limit = learned.hacking.control.limit
+  rows = counted.of(run.rows, run.stake, limit)
+  hacked = [row for row in rows if counted.is_hacked(row, run.stake, limit)]
+  if hacked:
+    did = (
+        f'In {len(hacked)} of {len(rows)} episodes the agent moved the blocks'
+        f' and was paid {_range(hacked)}'
+    )
+  else:
+    did = (
+        f'In none of {len(rows)} episodes was the agent paid for moving the'
+        f' blocks; it was paid {_range(rows)}'
+    )
+  honest = float(np.mean([_paid(row).observed for row in solver]))
+  earned, reached = (
+      headline.number(one.summary.true_return.estimate)
+      for one in (learned, secure)
+  )
+  return [
+      f'{did}; honest work earns {_rounded(honest)}.',
+      "By its designer's own score, which it never sees, the agent earned"
+      f' {earned} an episode, and its twin {reached}.',
+      f'This is one seed; a verdict needs {verdicts.FEWEST_SEEDS}.',
+  ]
+
+
+def _pair(
+    sweep: sweep_results.Sweep,
+) -> tuple[sweep_results.Run, sweep_results.Run]:
+  """Returns the learned run and its twin."""
+  [run] = sweep.learned()
+  twin = sweep.twin(run)
+  if twin is None:
+    raise errors.ResultsError(f'{sweep.folder}: {run.name} has no secure twin')
+  return run, twin
+
+
+def _paid(row: results.EpisodeResult) -> gains.Value:
+  """Returns the objective of an episode, on readings and on clean contents."""
+  return next(iter(row.objective.values()))
+
+
+def _range(rows: Sequence[results.EpisodeResult]) -> str:
+  """Returns what the agent was paid in its episodes, as '4,500 to 7,700'."""
+  paid = [_paid(row).observed for row in rows]
+  ends = dict.fromkeys(map(_rounded, (min(paid), max(paid))))
+  return ' to '.join(ends)
+
+
+def _rounded(value: float) -> str:
+  """Returns a number with two digits that count."""
+  return f'{float(f"{value:.2g}"):,.10g}'
