@@ -32,6 +32,9 @@ _TOLERANCE, _DEEPEST = 0.5, 0.05
 _PRECISION = 1e-6
 # Writes that move a block by at most this much, in m, are rounding errors.
 _SAME_PLACE = 1e-12
+# Most poses of mocap bodies whose corridors are remembered. Doors that slide
+# are seen in the same few poses in all worlds and episodes.
+_MOST_REMEMBERED = 1000
 _BOX = mujoco.mjtGeom.mjGEOM_BOX
 # MuJoCo computes no bounding boxes of planes. Height fields are the ground.
 _IGNORED_TYPES = (
@@ -78,6 +81,8 @@ class Surroundings:
     # Bounds between which no obstacle is, whatever value is written: the least
     # y and z, and the largest ones, `(4, ...)`.
     self._corridor = np.zeros(4)
+    # Those of one world, by the poses in it as bytes.
+    self._remembered: dict[bytes, np.ndarray] = {}
 
   def limit(self, low: float, high: float) -> None:
     """Sets the x coordinates at which undisturbed blocks are written, in m."""
@@ -217,6 +222,7 @@ class Surroundings:
   def _resolve(self, physics: protocols.Physics) -> None:
     """Finds frame and obstacles in a compiled model, and caches them."""
     self._model, self._physics = physics.model, None
+    self._remembered.clear()
     model = physics.model
     if model not in _copies:
       copied = copy.copy(model.ptr)
@@ -283,8 +289,17 @@ class Surroundings:
       self._corridor = np.zeros((4, *poses.shape[:-2]))
     for world in np.argwhere((poses != self._poses).any(axis=(-1, -2))):
       index = tuple(world)
-      self._corridor[:, *index] = self._corridor_in(poses[index])
+      self._corridor[:, *index] = self._recall_corridor(poses[index])
     self._poses = poses
+
+  def _recall_corridor(self, poses: np.ndarray) -> np.ndarray:
+    """Returns the same as `_corridor_in`, which takes longer."""
+    key = poses.tobytes()
+    if key not in self._remembered:
+      if len(self._remembered) == _MOST_REMEMBERED:
+        self._remembered.clear()
+      self._remembered[key] = self._corridor_in(poses)
+    return self._remembered[key]
 
   def _locate(self, poses: np.ndarray) -> tuple[np.ndarray, ...]:
     """Returns the obstacles of one world in the frame of the register.

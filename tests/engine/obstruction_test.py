@@ -9,6 +9,7 @@ import pytest
 from realab_suite import suite
 from realab_suite.entities import moving
 from realab_suite.entities import registers
+from realab_suite.entities import surroundings
 from realab_suite.evaluation import ledgers
 from realab_suite.evaluation import monitors
 from realab_suite.tasks import collect_apples
@@ -201,6 +202,75 @@ def test_a_shut_door_obstructs_and_an_open_one_does_not():
   assert (shut < 3.0).all()
   np.testing.assert_array_equal(np.array(found)[-3:, 1], 0.0)
   batch.close()
+
+
+def _past_doors() -> tuple[list[bytes], int, int]:
+  """Plays two episodes in which the doors of three worlds open in turn.
+
+  Returns:
+    The states and records of all steps, the number of searches for obstacles,
+    and that of obstructed writes.
+  """
+  search, searches, obstructed, played = mujoco.mj_kinematics, [], 0, []
+  with pytest.MonkeyPatch.context() as patch:
+    patch.setattr(
+        mujoco, 'mj_kinematics', lambda *data: searches.append(search(*data))
+    )
+    batch = suite.load_batch(
+        'unlock_door',
+        'standard',
+        {'random': 3},
+        num_envs=_NUM_ENVS,
+        num_threads=1,
+        design=_DIAGONAL,
+    )
+    ledger = ledgers.BatchLedger()
+    batch.add_sink(ledger)
+    (register,) = batch.mechanism.registers.values()
+    for _ in range(2):
+      batch.reset()
+      for step in range(16):
+        places = np.full((_NUM_ENVS, 2), 99.0)
+        places[step // 2 : step // 2 + 1] = _PAD
+        batch.task._pad.press(batch.physics, places)
+        if step == 5:
+          block = np.array(register.blocks[0].position(batch.physics))
+          block[..., :2] = _BESIDE_THE_DOOR
+          register.blocks[0].put(batch.physics, block)
+        batch.step(np.zeros((_NUM_ENVS, *batch.action_spec().shape)))
+        obstructed += np.count_nonzero(register.obstruction(batch.physics))
+        played.append(batch.save().to_bytes())
+    played += [repr(ledger.episodes(i)).encode() for i in range(_NUM_ENVS)]
+    batch.close()
+  return played, len(searches), obstructed
+
+
+def test_corridors_beside_doors_are_remembered(monkeypatch):
+  played, searches, obstructed = _past_doors()
+  monkeypatch.setattr(surroundings, '_MOST_REMEMBERED', 2)
+  kind = surroundings.Surroundings
+  with_few = _past_doors()
+  monkeypatch.setattr(kind, '_recall_corridor', kind._corridor_in)
+  without = _past_doors()
+  assert with_few[0] == without[0] == played
+  assert obstructed > 0
+  assert searches + 40 < with_few[1] < without[1]
+
+
+def test_corridors_are_forgotten_when_a_register_is_moved():
+  reward = {'place': [-0.5, -3.0], 'range': [0, 5]}
+  registers_ = {'reward': _DIAGONAL['registers']['reward'] | reward}
+  design = {**_DIAGONAL, 'registers': registers_, 'providers': []}
+  env = suite.load('unlock_door', 'standard', {'random': 3}, design=design)
+  env.reset()
+  (block,) = env.mechanism.registers['reward'].blocks
+  here = np.array(block.position(env.physics))
+  beyond = here + np.array([0.0, 8.5, 0.0])
+  for is_moved in (False, True, False):
+    block.surroundings.shift(np.array([0.0, 8.5 * is_moved]))
+    assert block.surroundings.are_far(env.physics, here) != is_moved
+    assert block.surroundings.are_far(env.physics, beyond) == is_moved
+  env.close()
 
 
 @pytest.mark.parametrize(('turn', 'yaw'), [(0.0, np.pi / 4), (0.6, 0.0)])
