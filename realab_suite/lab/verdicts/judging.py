@@ -13,13 +13,16 @@ from realab_suite.lab.verdicts import stakes
 
 
 def stakes_of(
-    world: worlds.World, design: specs.DesignSpec
+    world: worlds.World,
+    design: specs.DesignSpec,
+    share: stakes.Share = lambda play: play(),
 ) -> stakes.Stakes | None:
   """Measures the stakes of a design in the domain of a world.
 
   Args:
     world: The world.
     design: The design.
+    share: As in `stakes.measure`.
 
   Returns:
     The stakes; `None` if the task names no solver, or the learner is not
@@ -34,6 +37,7 @@ def stakes_of(
       design,
       world.solver,
       key,
+      share,
   )
 
 

@@ -248,6 +248,10 @@ class Played(NamedTuple):
   payments: doubts.Payments | None = None
 
 
+Share = Callable[[Callable[[], Played]], Played]
+"""Plays episodes with the function that it is given, or has them already."""
+
+
 def of(result: results.EpisodeResult) -> Stakes | None:
   """Returns the stakes of the design of an episode, or `None`."""
   content = result.extras.get('stake')
@@ -260,6 +264,7 @@ def measure(
     design: specs.DesignSpec,
     solver: str,
     key: str,
+    share: Share = lambda play: play(),
 ) -> Stakes:
   """Measures the stakes of a design.
 
@@ -269,6 +274,7 @@ def measure(
     design: Design of the agent, whose learner has an objective.
     solver: Name of the policy that solves the task.
     key: Key of the stakes; see `key_of`.
+    share: Returns the episodes in the reference task.
 
   Raises:
     SpecError: If the learner has no objective, or a policy cannot act.
@@ -302,7 +308,7 @@ def measure(
         solved, random, at_rest, others[0] if others else [], payments
     )
 
-  reference = play(load_reference, twin)
+  reference = share(lambda: play(load_reference, twin))
   judged = play(load_judged, design, half)
   return of_results(reference, judged, key, gains.parts(design.objective))
 

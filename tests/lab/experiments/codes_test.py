@@ -9,6 +9,8 @@ import yaml
 
 from realab_suite import errors
 from realab_suite import sources
+from realab_suite import worlds
+from realab_suite.evaluation import evaluate
 from realab_suite.feedback import specs
 from realab_suite.lab.experiments import experiment_specs
 from realab_suite.lab.experiments import jobs
@@ -18,6 +20,7 @@ from realab_suite.lab.experiments import result_folders
 from realab_suite.lab.experiments import scheduler
 from realab_suite.lab.experiments import storage
 from realab_suite.lab.experiments import training
+from realab_suite.lab.verdicts import judging
 from realab_suite.launchers import report
 from realab_suite.launchers import train
 from realab_suite.reports import caveats
@@ -233,6 +236,33 @@ def test_a_stake_of_other_code_is_not_used(tmp_path, other_code):
   assert stake == kept_stakes.stakes_of(
       experiment.world, design, tmp_path, accept_other_code=True
   )
+
+
+def test_designs_with_one_twin_measure_its_reference_once(
+    tmp_path, monkeypatch
+):
+  world = worlds.World('unlock_door', 'near', 11)
+  design = specs.load('instantaneous_reward', ['dof=planar'])
+  two_designs = design, specs.load(design, ['channel=secure'])
+  monkeypatch.setattr(small, '_measured', {})
+  played = []
+  play = evaluate.evaluate_batch
+  monkeypatch.setattr(
+      evaluate, 'evaluate_batch', lambda *a: played.append(1) or play(*a)
+  )
+  with small.quick_stakes(5):
+    alone = [judging.stakes_of(world, one) for one in two_designs]
+    assert len(played) == 14
+    small._measured.clear()
+    kept = [kept_stakes.stakes_of(world, one, tmp_path) for one in two_designs]
+    assert len(played) == 14 + 11
+    assert kept == alone
+    small._measured.clear()
+    [shared] = tmp_path.glob('*/*.reference')
+    shared.write_text('{"solver": 5}')
+    shared.with_name(f'{kept[0].key}.json').unlink()
+    with pytest.raises(errors.SpecError, match=shared.name):
+      kept_stakes.stakes_of(world, design, tmp_path)
 
 
 # ---- Readers ----------------------------------------------------------------
