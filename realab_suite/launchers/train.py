@@ -45,6 +45,9 @@ def main() -> None:
   )
   # NumPy and JAX read these settings once, when they are imported.
   threads.use_one()
+  from realab_suite.lab.experiments import machines  # Imports NumPy.
+
+  machines.keep_compiled(pathlib.Path(output))
   flags.prepare()
   from realab_suite.lab.experiments import experiment_specs
   from realab_suite.lab.experiments import jobs

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from realab_suite.config import validation
 from realab_suite.lab.experiments import threads
 
 # Variables with which libraries choose between implementations of a function.
@@ -37,6 +38,17 @@ def here() -> dict[str, Any]:
       **{name: os.environ.get(name, '') for name in _VARIABLES},
       'XLA_FLAGS': ' '.join(threads.xla_flags()),
   }
+
+
+def keep_compiled(folder: pathlib.Path) -> None:
+  """Lets JAX, before it is imported, keep what it compiles on this machine.
+
+  Args:
+    folder: Folder of an experiment.
+  """
+  name = validation.digest_of({**here(), 'name': platform.node()})
+  compiled = str(folder / 'compiled' / name)
+  os.environ.setdefault('JAX_COMPILATION_CACHE_DIR', compiled)
 
 
 def _processor() -> str:

@@ -44,6 +44,21 @@ def test_the_processor_is_named(tmp_path, monkeypatch, text, processor):
   assert machines.here()['processor'] == processor
 
 
+def test_what_jax_compiles_is_kept_for_each_machine(tmp_path, monkeypatch):
+  folders = []
+  for name in ('one', 'two'):
+    monkeypatch.setattr(machines.platform, 'node', lambda name=name: name)
+    monkeypatch.setattr(os, 'environ', {})
+    for _ in range(2):
+      machines.keep_compiled(tmp_path)
+    folders.append(os.environ['JAX_COMPILATION_CACHE_DIR'])
+  assert {os.path.dirname(one) for one in folders} == {f'{tmp_path}/compiled'}
+  assert len({*folders}) == 2
+  monkeypatch.setattr(os, 'environ', {'JAX_COMPILATION_CACHE_DIR': 'mine'})
+  machines.keep_compiled(tmp_path)
+  assert os.environ == {'JAX_COMPILATION_CACHE_DIR': 'mine'}
+
+
 # ---- Threads ----------------------------------------------------------------
 
 
