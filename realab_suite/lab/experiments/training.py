@@ -554,7 +554,12 @@ class _Training:
   def _record_episodes(self) -> None:
     """Records the episodes that have ended."""
     step = self._done * self._num_envs
-    records = [curves.record(step, one) for one in self._monitor.take()]
+    records = [
+        curves.record(step, one)
+        for one in self._monitor.take()
+        # New worlds may replace episodes before their first step.
+        if one.num_steps or not one.is_given_up
+    ]
     if records:
       self._files[TRAINING_EPISODES].append(records)
       self._pending += records

@@ -55,6 +55,19 @@ def test_an_experiment_is_the_same_by_name_by_path_and_by_content(
   assert not set(experiment.seeds) & set(experiment.calibration_seeds)
 
 
+@pytest.mark.parametrize('name', ['quick', 'verdict'])
+def test_new_experiments_have_segments_of_whole_episodes(name):
+  experiment = experiment_specs.load(name)
+  training = experiment.training
+  # An episode begins with a reset, which takes a step as well.
+  of_episodes = training.num_envs * (experiment.max_steps + 1)
+  assert training.checkpoint_every % of_episodes == 0
+  assert training.curve_every % of_episodes == 0
+  if name == 'verdict':
+    assert training.steps % of_episodes == 0
+    assert len(experiment.seeds) == 5
+
+
 def test_a_world_is_loaded_once_for_the_runs_that_share_it(monkeypatch):
   given = yaml.safe_load(_FILES[0].with_stem('defences').read_text())
   first = given['runs']['reward']

@@ -128,6 +128,26 @@ def _kill(job, output, monkeypatch, step):
 # ---- Results ----------------------------------------------------------------
 
 
+def test_segments_of_whole_episodes_abandon_none(tmp_path):
+  # An episode of 17 steps takes 18, of which a reset is the first; before the
+  # first episode, the worlds are reset already.
+  whole = {'checkpoint_every': 36 * _NUM_ENVS, 'steps': 72 * _NUM_ENVS}
+  path, _ = _run(_job(sleep=True, **whole), tmp_path)
+  records = _lines(path, training.TRAINING_EPISODES)
+  assert len(records) == 4 * _NUM_ENVS
+  assert {(one['end'], one['num_steps']) for one in records} == {
+      ('timeout', 17)
+  }
+  points = _lines(path, training.CURVE)
+  assert sum(point['num_invalid'] for point in points) == 0
+  # Those that are cut short are recorded.
+  path, _ = _run(_job(sleep=True), tmp_path)
+  records = _lines(path, training.TRAINING_EPISODES)
+  assert {(one['end'], one['num_steps']) for one in records} == {
+      ('timeout', 17), ('abandoned', 2), ('abandoned', 1)
+  }  # fmt: skip
+
+
 def test_the_learner_of_a_twin_is_evaluated_in_the_design_of_its_run(tmp_path):
   [twin] = jobs.plan(experiment_specs.load(_SMALL), only=['reward.secure'])
   path, _ = _run(twin, tmp_path)
