@@ -137,12 +137,12 @@ class Documents(Generic[_Spec]):
         text = self._files[source].read_bytes()
         self._parsed[source] = loading.parse_yaml(text, f'{source}.yaml')
       return f'{source}.yaml', copy.deepcopy(self._parsed[source])
-    if isinstance(source, str) and not os.path.exists(source):
+    where = os.path.expanduser(source)
+    if isinstance(source, str) and not os.path.exists(where):
       raise errors.UnknownNameError(
           f'{what} {messages.quote(source)} is neither a file nor one of'
           f' {list(self.names)}{messages.did_you_mean(source, self.names)}'
       )
-    where = os.fspath(source)
     if is_confined and not loading.is_inside(where):
       raise errors.SpecError(
           f'{what} {messages.quote(where)} is outside the working directory;'

@@ -31,9 +31,12 @@ _FIRM = (0.05, 1.0)
 # the yaw of the avatar where the block cannot turn. These welds have damping
 # and no stiffness: they match velocities, whatever the angle is, and a block
 # that is stuck brakes the avatar a little. Each is for the angles of up to an
-# eighth of a turn from its own, as a weld half a turn away has no effect.
+# eighth of a turn from its own, as a weld half a turn away has no effect. They
+# are weak, with a large weight of torques, because a weld that matches the
+# other velocities as well keeps a block from coming to the hand.
 _NUM_WELDS = 4
-_TURNING_IMPEDANCE = 0.98
+_TURNING_IMPEDANCE = 0.5
+_TORQUE_SCALE = 5.0
 
 
 @final
@@ -92,6 +95,7 @@ class Grasp:
             relpose=[*hand.pos, np.cos(angle / 2), 0, 0, np.sin(angle / 2)],
             anchor=(0, 0, 0),
             active='false',
+            torquescale=_TORQUE_SCALE,
             solref=(0, -_DAMPING),
             solimp=(_TURNING_IMPEDANCE, _TURNING_IMPEDANCE, 0.001),
         )

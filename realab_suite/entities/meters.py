@@ -9,6 +9,7 @@ from dm_control import mjcf
 from dm_control.composer.observation import observable
 import numpy as np
 
+from realab_suite import errors
 from realab_suite.entities import axes
 from realab_suite.entities import modelled
 from realab_suite.entities import protocols
@@ -162,6 +163,30 @@ class MeterHooks(composer.Entity):
   @property
   def mjcf_model(self) -> mjcf.RootElement:
     return self._meter.mjcf_model
+
+  def after_compile(
+      self, physics: protocols.Physics, random_state: np.random.RandomState
+  ) -> None:
+    """Checks a newly compiled world.
+
+    Raises:
+      SpecError: If another meter writes the register.
+    """
+    del physics, random_state
+    register = self._meter.register
+    root: composer.Entity = self._meter
+    while root.parent is not None:
+      root = root.parent
+    writers = [
+        entity
+        for entity in root.iter_entities()
+        if isinstance(entity, Meter) and entity.register is register
+    ]
+    if len(writers) > 1:
+      raise errors.SpecError(
+          f'meter: register {register.name!r} has {len(writers)} meters in the'
+          ' world; must have one'
+      )
 
   def before_step(
       self, physics: protocols.Physics, random_state: np.random.RandomState

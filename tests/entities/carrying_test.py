@@ -84,6 +84,7 @@ def test_a_held_block_whose_heading_is_read_turns_with_the_hand(dof, written):
   world = avatar_worlds.make(registers.BlockOrientationRegister, dof=dof)
   register, physics = world.register, world.physics
   world.grasp()
+  assert np.linalg.norm((world.block - world.hand)[:2]) < 0.05
   register.write(physics, written)
   yaws = []
   for steps, commands in (

@@ -256,6 +256,15 @@ def test_a_wrong_world_is_refused():
     other.detach()
 
 
+def test_a_register_has_one_meter():
+  score = _register('score', role='meter')
+  task = _task([score], [meters.Meter(_value, score)])
+  _make(task).reset()
+  task.root_entity.attach(meters.Meter(_value, score))
+  with pytest.raises(errors.SpecError, match="'score' has 2 meters in the wor"):
+    _make(task)
+
+
 def test_a_loaded_world_refuses_it():
   task, reward = unlock_door.UnlockDoor(), _register('reward')
   reward.attach_to(task.root_entity, (1.0, -2.0))

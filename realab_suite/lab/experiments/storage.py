@@ -83,7 +83,7 @@ def new_folder(output: str) -> pathlib.Path:
   Raises:
     ResultsError: If the folder is not empty or cannot be created.
   """
-  folder = pathlib.Path(output)
+  folder = pathlib.Path(output).expanduser()
   with explained(folder):
     folder.mkdir(parents=True, exist_ok=True)
     is_empty = not any(folder.iterdir())

@@ -8,6 +8,7 @@ import pathlib
 import pytest
 
 from realab_suite import errors
+from realab_suite.feedback import specs
 from realab_suite.lab.experiments import jobs
 from realab_suite.lab.experiments import storage
 
@@ -160,3 +161,13 @@ def test_a_group_that_shares_its_files_shares_locks(tmp_path, umask, mode):
       assert (tmp_path / 'new' / 'lock').stat().st_mode & 0o777 == mode
   finally:
     os.umask(before)
+
+
+def test_home_folders_of_outputs_and_designs_are_expanded(
+    tmp_path, monkeypatch
+):
+  monkeypatch.setenv('HOME', str(tmp_path))
+  assert storage.new_folder('~/results') == tmp_path / 'results'
+  design = specs.load('instantaneous_reward')
+  (tmp_path / 'mine.yaml').write_text(json.dumps(design.to_mapping()))
+  assert specs.load('~/mine.yaml') == design
