@@ -148,4 +148,4 @@ class Documents(Generic[_Spec]):
           f'{what} {messages.quote(where)} is outside the working directory;'
           f' allowed in a file are paths within it and {list(self.names)}'
       )
-    return where, loading.read_mapping(source)
+    return where, loading.read_mapping(where)
