@@ -53,7 +53,7 @@ class Phases:
       ports: Ports of its registers, by name.
       counters: Slots `step_count` and `score`.
       queries: Registers that the agent writes.
-      of_providers: `FeedbackProvider`s, in the order of the design.
+      of_providers: Each a `FeedbackProvider`, in the order of the design.
     """
     self.meters: list[
         tuple[Sequence[str], meters.Meter, register_writes.Target]
