@@ -24,6 +24,7 @@ from realab_suite.engine import embedding
 from realab_suite.engine import single_physics
 from realab_suite.entities import arenas
 from realab_suite.entities import registers
+from realab_suite.entities import state
 from realab_suite.feedback import mechanisms
 from realab_suite.feedback import register_kinds
 from realab_suite.feedback import specs
@@ -311,6 +312,7 @@ def _built(
   arena = arenas.OpenRoom()
   register = kind('shown', value_range=_RANGE)
   register.attach_to(arena, (0.0, 0.0))
+  state.make_room(arena.mjcf_model)
   physics = single_physics.ThinPhysics.from_mjcf_model(arena.mjcf_model)
   return register, physics
 

@@ -80,12 +80,12 @@ def test_a_sweep_needs_the_solver_as_its_control(tmp_path):
   run = {**fake_sweep.EXPERIMENT['runs']['reward'], 'twin': False}
   one = fake_sweep.experiment(
       runs={'reward': run},
-      baselines=['carrying_saboteur', 'solver', 'random'],
+      baselines=['carrying_saboteur', 'random'],
       seeds=[0],
   )
   card = scorecards.make([fake_sweep.build(tmp_path / 'sweep', one)])
   cell = card.cells[_NEAR, 'instantaneous_reward']
-  assert cell.reasons[_Why.BASELINE] == 'its control is carrying_saboteur'
+  assert cell.reasons[_Why.BASELINE] == 'its control is random'
   assert cell.rates == {}
 
 
