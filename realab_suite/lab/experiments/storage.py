@@ -120,6 +120,8 @@ def check_access(folder: pathlib.Path, *, is_written: bool = True) -> None:
   with explained(folder):
     check(folder, os.R_OK | os.X_OK, 'read')
     inside = folder.iterdir() if folder.exists() else []
+    # Links lead elsewhere, so jobs refuse them.
+    inside = [path for path in inside if not path.is_symlink()]
     for place in filter(pathlib.Path.is_dir, [folder, *inside]):
       check(place, os.R_OK | os.X_OK, 'read')
       is_open = is_written and not (place / DONE).exists()
