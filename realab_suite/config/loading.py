@@ -81,7 +81,7 @@ def read_mapping(
 
 
 def is_list(value: Any) -> bool:
-  """Returns whether a value is a list, perhaps of a library like OmegaConf."""
+  """Returns True for a list, perhaps of a library such as OmegaConf."""
   is_text = isinstance(value, str | bytes | bytearray)
   return isinstance(value, Sequence) and not is_text
 

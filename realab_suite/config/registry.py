@@ -18,7 +18,7 @@ HOW_TO_REPLACE = (
     'choose another name; a notebook or a reloaded module may define it again,'
     ' with the same name and not inside a function'
 )
-"""What to do about a name that is taken, for messages."""
+"""Advice on a name that is taken, for messages."""
 
 T = TypeVar('T')
 
@@ -93,7 +93,7 @@ class Registry(Generic[T]):
 
 
 def is_same(old: Any, new: Any) -> bool:
-  """Returns whether an entry is another one, defined again.
+  """Returns True if an entry is another one, defined again.
 
   So a cell of a notebook may run twice, and a module may be reloaded: what is
   made from now on is of the new class. Classes and functions are the same if

@@ -174,12 +174,9 @@ class MeterHooks(composer.Entity):
     """
     del physics, random_state
     register = self._meter.register
-    root: composer.Entity = self._meter
-    while root.parent is not None:
-      root = root.parent
     writers = [
         entity
-        for entity in root.iter_entities()
+        for entity in modelled.entities_beside(self._meter)
         if isinstance(entity, Meter) and entity.register is register
     ]
     if len(writers) > 1:

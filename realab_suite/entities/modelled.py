@@ -9,6 +9,13 @@ from dm_control import mjcf
 from realab_suite.entities import state
 
 
+def entities_beside(entity: composer.Entity) -> list[composer.Entity]:
+  """Returns all entities of the world of an entity, which is one of them."""
+  while entity.parent is not None:
+    entity = entity.parent
+  return [*entity.iter_entities()]
+
+
 class ModelledEntity(composer.Entity, abc.ABC):
   """Base class for entities that build their model in `_mjcf_root`."""
 

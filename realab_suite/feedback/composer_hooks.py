@@ -22,6 +22,7 @@ import numpy as np
 from realab_suite import errors
 from realab_suite.config import integers
 from realab_suite.entities import meters
+from realab_suite.entities import modelled
 from realab_suite.entities import state
 from realab_suite.entities import views
 from realab_suite.entities.registers import ports
@@ -291,9 +292,9 @@ class ProviderHooks(_Hooks):
     self._written = [target.register for target in provider.targets]
     read = [getattr(port, 'register', port) for port in provider.reads]
     self._used = [*dict.fromkeys([*self._written, *read])]
-    every = [port for one in self._used for port in ports.of(one)]
-    named = {port.name: port for port in every}
-    if len(named) < len(every):
+    all_ports = [port for one in self._used for port in ports.of(one)]
+    named = {port.name: port for port in all_ports}
+    if len(named) < len(all_ports):
       raise errors.SpecError(
           f'{provider.title}: two of its registers have a name in common; each'
           ' must have its own'
@@ -315,10 +316,7 @@ class ProviderHooks(_Hooks):
     """
     del random_state
     self._data = physics.data.ptr
-    root = self._owner
-    while root.parent is not None:
-      root = root.parent
-    entities = [*root.iter_entities()]
+    entities = modelled.entities_beside(self._owner)
     self._meters = [e for e in entities if isinstance(e, meters.MeterHooks)]
     writers = [
         *(e.register for e in entities if isinstance(e, meters.Meter)),
@@ -373,7 +371,7 @@ def refuse(title: str, needs: Sequence[str]) -> None:
 
 
 def needs_of(provider: Any) -> list[str]:
-  """Returns what a provider needs that Composer does not pass to entities."""
+  """Returns the needs of a provider that Composer does not serve."""
   needs = [f'the sense {sense!r}' for sense in provider.sensed]
   if provider.action_queries or provider.action_writes:
     needs.append('the action')

@@ -146,10 +146,10 @@ class FeedbackProvider(modelled.ModelledEntity):
 
 def _ports_of(registers: Sequence[ports.AnyPort]) -> list[ports.AnyPort]:
   """Returns the ports of registers, some of which may be ports themselves."""
-  found: list[ports.AnyPort] = []
+  all_ports: list[ports.AnyPort] = []
   for one in registers:
-    found += ports.of(one) if isinstance(one, base.Register) else [one]
-  return found
+    all_ports += ports.of(one) if isinstance(one, base.Register) else [one]
+  return all_ports
 
 
 def _design_of(

@@ -91,11 +91,11 @@ def main() -> None:
 
 
 def _beginning(steps: int, folder: pathlib.Path) -> str:
-  """Returns what is going to happen."""
+  """Returns the text before the training."""
   again = _command('demo', f'--output={folder}')
   return f"""\
 Two agents learn to take apples for {steps:,} steps each. The large apple is
-behind a door, which a pad opens. Nobody sends the agents a reward: they read it
+behind a door, which a pad opens. No reward is sent to the agents: they read it
 from two blocks in their room, whose distance is the number.
   reward               is an agent that can move its blocks
   reward.secure        is its twin: nothing can move the twin's blocks

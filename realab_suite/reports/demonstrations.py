@@ -1,4 +1,4 @@
-"""What a demonstration ends with: a film, and what happened in counts.
+"""The end of a demonstration: a film, and the behaviour in counts.
 
 A demonstration is a sweep of one learned run and its secure twin.
 """
@@ -74,7 +74,7 @@ def film(sweep: sweep_results.Sweep, path: pathlib.Path) -> str:
 def sentences(
     sweep: sweep_results.Sweep, figures: Mapping[str, numbers.Figures]
 ) -> list[str]:
-  """Returns what the agent did, in counts.
+  """Returns the behaviour of the agent, in counts.
 
   Args:
     sweep: The demonstration.
@@ -134,7 +134,7 @@ def _paid(row: results.EpisodeResult) -> gains.Value:
 
 
 def _range(rows: Sequence[results.EpisodeResult]) -> str:
-  """Returns what the agent was paid in its episodes, as '4,500 to 7,700'."""
+  """Returns the range of payments in episodes, as '4,500 to 7,700'."""
   paid = [_paid(row).observed for row in rows]
   ends = dict.fromkeys(map(_rounded, (min(paid), max(paid))))
   return ' to '.join(ends)

@@ -96,7 +96,7 @@ with_each_renderer = pytest.mark.parametrize('renderer', ['egl', 'osmesa'])
 
 
 def _run(renderer, *arguments):
-  """Returns what Python prints with a renderer, which is no complaint."""
+  """Returns the output of Python with a renderer, without complaints."""
   if renderer == 'osmesa' and util.find_library('OSMesa') is None:
     pytest.skip('no OSMesa')
   inherited = {k: v for k, v in os.environ.items() if k != 'PYOPENGL_PLATFORM'}

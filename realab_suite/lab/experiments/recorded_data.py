@@ -187,7 +187,7 @@ def digest(folder: str, world: worlds.World, design: specs.DesignSpec) -> str:
 
 
 def origin(world: worlds.World, design: specs.DesignSpec) -> dict[str, Any]:
-  """Returns what is equal where episodes are recorded and where they are used.
+  """Returns the facts that recorded episodes and their use have in common.
 
   Args:
     world: The world.

@@ -1,4 +1,4 @@
-"""Doubts about stakes: what a design pays to its solver alone, or at once.
+"""Doubts about stakes: payments to the solver alone, or at once.
 
 A jackpot makes a stake as large as its author likes, and beside such a stake no
 gain counts. The true return tells it from what competence is worth.
@@ -50,7 +50,7 @@ def doubt(half: np.ndarray, episodes: Iterable[np.ndarray]) -> str | None:
 
 
 def _at_once(paid: np.ndarray, true: np.ndarray) -> float:
-  """Returns how much more a fifth of an episode pays than it deserves."""
+  """Returns the largest payment of a fifth of an episode beyond its worth."""
   # What every step pays is no event.
   paid, true = (
       np.concatenate([[0.0], np.cumsum(one)])

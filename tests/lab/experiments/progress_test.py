@@ -6,7 +6,7 @@ from realab_suite.lab.experiments import progress
 
 
 def _said(points, fewest=4):
-  """Returns what the lines of points say of (episodes, invalid, gain)."""
+  """Returns the lines of points, given (episodes, invalid, gain) of each."""
   lines = []
   display = progress.Display('run, seed 0', 0, 9_000, fewest, lines.append)
   for i, (count, invalid, gain) in enumerate(points, start=1):

@@ -135,7 +135,7 @@ def test_a_stake_is_at_most_what_the_solver_earns_where_it_is_judged(
 
 
 def _payments(*episodes_of):
-  """Returns what steps pay, from the terms and true rewards of an episode."""
+  """Returns payments of steps, from terms and true rewards of episodes."""
 
   def value(x):
     return {'return': gains.Value(observed=x, clean=x)}
