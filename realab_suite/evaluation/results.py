@@ -220,10 +220,7 @@ def versions() -> dict[str, str]:
       'realab_suite': _versions.VERSION,
       'code': sources.digest(),
       'python': platform.python_version(),
-      **{
-          name: version_of(name)
-          for name in ('dm-control', 'mujoco', 'numpy')
-      },
+      **{name: version_of(name) for name in ('dm-control', 'mujoco', 'numpy')},
   }
 
 
