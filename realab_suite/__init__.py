@@ -10,6 +10,8 @@ Agents can tamper with all of their feedback in these worlds.
 """
 
 import importlib
+import pathlib
+import sys
 from typing import TYPE_CHECKING, Any
 
 from realab_suite import _display
@@ -60,6 +62,12 @@ def __dir__() -> list[str]:
   return sorted({*globals(), *_FUNCTIONS})
 
 
-_versions.check()
+try:
+  _versions.check()
+except _versions.DependencyError as error:
+  # The command imports this first, so that nothing else can say it.
+  if pathlib.Path(''.join(sys.argv[:1])).name == 'realab':
+    sys.exit(str(error))
+  raise
 # Before the import of dm_control, which chooses a renderer.
 _display.prepare()

@@ -19,6 +19,8 @@ _RANGES = (
     ('dm-control', '1.0.50', '2'),
     ('mujoco', '3.17', '4'),
 )
+# pip cannot install these over mujoco 3: with it, it removes what is theirs.
+_MUJOCO_4 = 'mujoco', 'mujoco-core', 'mujoco-studio'
 
 
 class DependencyError(errors.RealabError, ImportError):
@@ -38,10 +40,13 @@ def check() -> None:
     return
   present = ' and '.join(f'{n} {v or "missing"}' for n, v in installed.items())
   needed = ' and '.join(f'{n}>={low},<{high}' for n, low, high in _RANGES)
+  remove = ''
+  if _release(installed['mujoco'] or '') >= (4,):
+    remove = f'python -m pip uninstall -y {" ".join(_MUJOCO_4)}; '
   quoted = ' '.join(f'"{n}>={low},<{high}"' for n, low, high in _RANGES)
   raise DependencyError(
       f'realab_suite: found {present}; needs {needed};'
-      f' run: python -m pip install {quoted}'
+      f' run: {remove}python -m pip install {quoted}'
   )
 
 

@@ -1,9 +1,11 @@
 """Tests that the package's metadata match its files and dependencies."""
 
 import configparser
+import importlib
 from importlib import metadata
 import pathlib
 import re
+import sys
 
 import pytest
 
@@ -68,11 +70,23 @@ def test_a_wrong_pair_is_refused_in_one_line_with_the_remedy(
   with pytest.raises(ImportError) as caught:
     _versions.check()
   assert isinstance(caught.value, errors.RealabError)
+  remove = 'python -m pip uninstall -y mujoco mujoco-core mujoco-studio; '
   assert str(caught.value) == (
       f'realab_suite: found {found};'
       ' needs dm-control>=1.0.50,<2 and mujoco>=3.17,<4;'
-      ' run: python -m pip install "dm-control>=1.0.50,<2" "mujoco>=3.17,<4"'
+      f' run: {remove if "4.0" in found else ""}python -m pip install'
+      ' "dm-control>=1.0.50,<2" "mujoco>=3.17,<4"'
   )
+
+
+def test_the_doctor_says_in_one_line_that_mujoco_4_is_installed(monkeypatch):
+  _install(monkeypatch, mujoco='4.0.0')
+  monkeypatch.setattr(sys, 'argv', ['/usr/bin/realab', 'doctor'])
+  with pytest.raises(SystemExit, match=r'^realab_suite: found .* mujoco 4'):
+    importlib.reload(realab_suite)
+  monkeypatch.setattr(sys, 'argv', ['/usr/bin/python3'])
+  with pytest.raises(_versions.DependencyError):
+    importlib.reload(realab_suite)
 
 
 def test_the_checked_ranges_are_those_that_pip_is_given():
