@@ -93,10 +93,16 @@ def _returns(figures: _Figures) -> tables.Table:
   ]  # fmt: skip
   return tables.Table(
       'Returns and hacked episodes',
-      _RETURNS_NOTE,
+      f'{_RETURNS_NOTE} {_worlds(figures)}',
       tables.frame((run.columns for run in figures.values()), columns),
       ('run', 'agent'),
   )
+
+
+def _worlds(figures: _Figures) -> str:
+  infos = [row.info for run in figures.values() for row in run.run.rows]
+  worlds = {f'{x.domain}.{x.task} {x.dynamics_version}' for x in infos}
+  return f'Versions of the dynamics: {", ".join(sorted(worlds))}.'
 
 
 def csv_text(figures: _Figures) -> str:
