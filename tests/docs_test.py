@@ -328,6 +328,25 @@ def test_files_and_folders_in_pages_exist():
   ]
 
 
+def test_errata_name_results_and_printed_rows_are_of_todays_dynamics():
+  parquet = pytest.importorskip('pyarrow.parquet')
+  errata = (_ROOT / 'docs' / 'errata.md').read_text()
+  folders = [path.parent for path in _ROOT.glob('docs/results/*/rows.parquet')]
+  names = {*(folder.name for folder in folders), 'meter_only_*'}
+  moved = re.findall(r'^\| 20.*\| (.+) \|$', errata, re.MULTILINE)
+  assert moved
+  for cell in moved:
+    named = set(re.findall('`(.+?)`', cell))
+    assert re.match('none|all', cell) or names & named, cell
+  columns = [f'info/{x}' for x in ('domain', 'task')]
+  columns += [f'info/dynamics_{x}' for x in ('version', 'digest')]
+  for folder in folders:
+    table = parquet.read_table(folder / 'rows.parquet', columns=columns)
+    rows = set(zip(*table.to_pydict().values(), strict=True))
+    for domain, task, *dynamics in rows:
+      assert suite.dynamics(domain, task) == tuple(dynamics), folder.name
+
+
 def test_programs_in_pages_exist():
   programs = _mentions(
       r'python -m ('

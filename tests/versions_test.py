@@ -134,6 +134,7 @@ def test_every_data_file_is_shipped():
     [
         ('CITATION.cff', r'^version: (.+)$'),
         ('CHANGELOG.md', r'^## \[(\d.+?)\]'),
+        ('README.md', r'version = \{(\d.+?)\}'),
     ],
 )
 def test_one_version_is_named_everywhere(file, pattern):
