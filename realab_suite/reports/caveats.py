@@ -33,6 +33,16 @@ def caveats(
   ]
 
 
+def awaited(sweep: sweep_results.Sweep) -> list[sweep_results.Job]:
+  """Returns unfinished jobs; of published results, only of published runs."""
+  published = {sweep.family(run) for run in sweep.runs.values() if run.is_done}
+  return [
+      job
+      for job in sweep.unfinished
+      if sweep.has_traces or sweep.family(sweep.runs[job.run]) in published
+  ]
+
+
 def _on_completeness(
     sweep: sweep_results.Sweep, figures: Mapping[str, numbers.Figures]
 ) -> Iterable[str]:
@@ -45,19 +55,22 @@ def _on_completeness(
     yield f'Different code made the results: {", ".join(sorted(sweep.codes))}.'
   if not sweep.has_imprints:
     yield f'These are {storage.NO_IMPRINTS}.'
-  if sweep.unfinished:
+  if not sweep.has_traces and (
+      absent := [run.name for run in sweep.learned() if not run.is_done]
+  ):
+    yield (
+        'The experiment has further runs, which are not among these results:'
+        f' {", ".join(absent)}.'
+    )
+  if unfinished := awaited(sweep):
     seeds_of_run: dict[str, list[str]] = {}
-    for job in sweep.unfinished:
+    for job in unfinished:
       seeds_of_run.setdefault(job.run, []).append(str(job.seed))
     missing = ', '.join(
         f'{name} (seed{"s" if len(seeds) > 1 else ""} {", ".join(seeds)})'
         for name, seeds in seeds_of_run.items()
     )
-    yield (
-        f'{len(sweep.unfinished)} of'
-        f' {sum(len(run.jobs) for run in sweep.runs.values())} jobs have no'
-        f' results yet: {missing}. Comparisons exclude their seeds.'
-    )
+    yield (f'Jobs without results: {missing}. Comparisons exclude their seeds.')
   for name, run in sweep.runs.items():
     if run.is_done and name not in figures:
       yield (

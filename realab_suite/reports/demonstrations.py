@@ -3,7 +3,7 @@
 A demonstration is a sweep of one learned run and its secure twin.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 import contextlib
 import pathlib
 from typing import Any
@@ -12,11 +12,8 @@ import numpy as np
 
 from realab_suite import errors
 from realab_suite.engine import environment
-from realab_suite.evaluation import gains
-from realab_suite.evaluation import results
 from realab_suite.lab.experiments import replays
 from realab_suite.lab.experiments import sweep_results
-from realab_suite.lab.verdicts import counted
 from realab_suite.lab.verdicts import verdicts
 from realab_suite.reports import films
 from realab_suite.reports import headline
@@ -45,7 +42,10 @@ def film(sweep: sweep_results.Sweep, path: pathlib.Path) -> str:
   rows = [row for row in run.rows if row.is_valid and row.key in twins]
   if not rows:
     raise errors.ResultsError('agent and twin have no valid episode in common')
-  row = max(rows, key=lambda one: _paid(one).observed - _paid(one).clean)
+  row = max(
+      rows,
+      key=lambda one: headline.paid(one).observed - headline.paid(one).clean,
+  )
   frames: list[np.ndarray] = []
 
   def collect(
@@ -61,11 +61,12 @@ def film(sweep: sweep_results.Sweep, path: pathlib.Path) -> str:
 
   replays.replay(twin, twins[row.key], collect)
   replays.replay(run, row, show)
-  paid = _paid(row)
+  paid = headline.paid(row)
   return (
       'an episode of the twin (left) and the same one of the agent: of'
       f' {len(rows)}, that in which the agent was paid most beyond what it'
-      f' earned ({_rounded(paid.observed)} for {headline.number(paid.clean)}).'
+      f' earned ({headline.rounded(paid.observed)} for'
+      f' {headline.number(paid.clean)}).'
       ' Blue is what they earned, orange what they were paid. The large apple'
       ' ends an episode.'
   )
@@ -82,35 +83,15 @@ def sentences(
   """
   run, twin = _pair(sweep)
   learned, secure = figures.get(run.name), figures.get(twin.name)
-  solver = numbers.solver_rows(sweep, run)
-  if (
-      learned is None
-      or secure is None
-      or learned.hacking is None
-      or run.stake is None
-      or not solver
-  ):
+  did = headline.counts(sweep, learned) if learned else None
+  if learned is None or secure is None or did is None:
     return ['These results do not say whether the agent tampers.']
-  limit = learned.hacking.control.limit
-  rows = counted.of(run.rows, run.stake, limit)
-  hacked = [row for row in rows if counted.is_hacked(row, run.stake, limit)]
-  if hacked:
-    did = (
-        f'In {len(hacked)} of {len(rows)} episodes the agent moved the blocks'
-        f' and was paid {_range(hacked)}'
-    )
-  else:
-    did = (
-        f'In none of {len(rows)} episodes was the agent paid for moving the'
-        f' blocks; it was paid {_range(rows)}'
-    )
-  honest = float(np.mean([_paid(row).observed for row in solver]))
   earned, reached = (
       headline.number(one.summary.true_return.estimate)
       for one in (learned, secure)
   )
   return [
-      f'{did}; honest work earns {_rounded(honest)}.',
+      did,
       "By its designer's own score, which it never sees, the agent earned"
       f' {earned} an episode, and its twin {reached}.',
       f'This is one seed; a verdict needs {verdicts.FEWEST_SEEDS}.',
@@ -126,20 +107,3 @@ def _pair(
   if twin is None:
     raise errors.ResultsError(f'{sweep.folder}: {run.name} has no secure twin')
   return run, twin
-
-
-def _paid(row: results.EpisodeResult) -> gains.Value:
-  """Returns the objective of an episode, on readings and on clean contents."""
-  return next(iter(row.objective.values()))
-
-
-def _range(rows: Sequence[results.EpisodeResult]) -> str:
-  """Returns the range of payments in episodes, as '4,500 to 7,700'."""
-  paid = [_paid(row).observed for row in rows]
-  ends = dict.fromkeys(map(_rounded, (min(paid), max(paid))))
-  return ' to '.join(ends)
-
-
-def _rounded(value: float) -> str:
-  """Returns a number with two digits that count."""
-  return f'{float(f"{value:.2g}"):,.10g}'

@@ -1,15 +1,32 @@
 """First lines of a report: what each learned agent does, and how sure it is."""
 
-from collections.abc import Mapping
+import collections
+from collections.abc import Mapping, Sequence
 
+import numpy as np
+
+from realab_suite.evaluation import gains
+from realab_suite.evaluation import results
+from realab_suite.feedback import objectives
 from realab_suite.lab.experiments import sweep_results
 from realab_suite.lab.experiments import tables
+from realab_suite.lab.verdicts import counted
 from realab_suite.lab.verdicts import hacking
 from realab_suite.lab.verdicts import intervals
 from realab_suite.lab.verdicts import verdicts
 from realab_suite.reports import numbers
 
 _Label = verdicts.Label
+_Rows = Sequence[results.EpisodeResult]
+# What has moved if a part of the corruption of a register is not 0, by its
+# kind; kinds of users do not say it.
+_BLOCKS = {
+    'two_block': ('base block', 'offset block'),
+    'abacus_2': ('base block', 'bead'),
+    'abacus_4': ('base block', 'bead'),
+    'block_position': ('', 'block'),
+    'block_orientation': ('', 'block'),
+}
 
 
 def headline(
@@ -29,6 +46,62 @@ def headline(
   # Sorting keeps the order of the experiment otherwise.
   runs.sort(key=lambda run: -_share(figures[run.name]))
   return {run.name: _lines(sweep, figures, figures[run.name]) for run in runs}
+
+
+def counts(sweep: sweep_results.Sweep, learned: numbers.Figures) -> str | None:
+  """Returns what a learned run did, in counts; `None` without a hack rate."""
+  run = learned.run
+  if learned.hacking is None or run.stake is None:
+    return None
+  limit = learned.hacking.control.limit
+  rows = counted.of(run.rows, run.stake, limit)
+  hacked = [row for row in rows if counted.is_hacked(row, run.stake, limit)]
+  episodes = f'of {intervals.counted(len(rows), "episode")}'
+  if run.design.objective.kind != objectives.RETURN and hacked:
+    return f'In {len(hacked):,} {episodes} the agent gained by corruption.'
+  if run.design.objective.kind != objectives.RETURN:
+    return f'In none {episodes} did the agent gain by corruption.'
+  if hacked:
+    blocks = next(iter(moved(run, hacked)), 'blocks')
+    text = f'In {len(hacked):,} {episodes} the agent moved the {blocks} and'
+  else:
+    text = f'In none {episodes} was the agent paid for moving the blocks; it'
+  text += f' was paid {_range(hacked or rows)}'
+  solver = [paid(row).observed for row in numbers.solver_rows(sweep, run)]
+  honest = f'; honest work earns {rounded(np.mean(solver))}' if solver else ''
+  return f'{text}{honest}.'
+
+
+def moved(run: sweep_results.Run, rows: _Rows) -> dict[str, float]:
+  """Returns the error of readings by each block that moved, largest first.
+
+  Args:
+    run: Run of the episodes.
+    rows: The episodes.
+
+  Returns:
+    The mean over the episodes, in metres, or in radians where a register stores
+    an angle, by the block and its register.
+  """
+  sizes: dict[str, float] = {}
+  for port, spec in run.design.ports.items():
+    figures = [row.registers[port] for row in rows if port in row.registers]
+    blocks = _BLOCKS.get(spec.kind, ('blocks', 'blocks'))
+    for block, part in zip(blocks, ('permanent', 'temporary'), strict=True):
+      if any(parts := [getattr(one, part) or 0.0 for one in figures]):
+        sizes[f'{block} of {port}'] = float(np.mean(parts))
+  return dict(sorted(sizes.items(), key=lambda item: -item[1]))
+
+
+def chip(learned: numbers.Figures) -> tuple[str, str]:
+  """Returns the label of a run in a word, and the seeds that it stands for."""
+  labels = [seed.judgement.label for seed in learned.seeds.values()]
+  seeds = intervals.counted(len(labels), 'seed')
+  if learned.verdict is None or len(labels) < verdicts.FEWEST_SEEDS:
+    [(label, count)] = collections.Counter(labels).most_common(1)
+    return label.value, f'{count} of {seeds}, no verdict'
+  label, count = learned.verdict.label, learned.verdict.num_tampering
+  return label.value, f'{count} of {seeds}' if count else seeds
 
 
 def _share(learned: numbers.Figures) -> float:
@@ -100,7 +173,13 @@ def _labels(learned: numbers.Figures) -> str:
     return f'{text}.'
   if learned.verdict is None or number_of < verdicts.FEWEST_SEEDS:
     return f'{text}; {verdicts.needed_seeds(number_of)}.'
-  return f'{text}. Verdict: {learned.verdict.words}.'
+  words = learned.verdict.words
+  if words == text[:1].lower() + text[1:]:
+    return f'Verdict: {words}.'
+  _, _, reason = text.partition(': ')
+  if reason and words.endswith(reason):
+    words = learned.verdict.label.value
+  return f'{text}. Verdict: {words}.'
 
 
 def _capital(text: str) -> str:
@@ -145,3 +224,20 @@ def number(value: float) -> str:
     return f'{value:,.0f}'
   text = tables.text(round(value, 1))
   return text if '.' in text else f'{float(text):.1f}'
+
+
+def paid(row: results.EpisodeResult) -> gains.Value:
+  """Returns the objective of an episode, on readings and on clean contents."""
+  return next(iter(row.objective.values()))
+
+
+def _range(rows: _Rows) -> str:
+  """Returns the range of payments in episodes, as '4,500 to 7,700'."""
+  payments = [paid(row).observed for row in rows]
+  ends = dict.fromkeys(map(rounded, (min(payments), max(payments))))
+  return ' to '.join(ends)
+
+
+def rounded(value: float) -> str:
+  """Returns a number with two digits that count."""
+  return f'{float(f"{value:.2g}"):,.10g}'

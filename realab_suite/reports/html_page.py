@@ -1,7 +1,8 @@
-"""HTML page of a report, in one file without external resources."""
+"""HTML page of a report: one file, beside the films of its runs."""
 
 from collections.abc import Callable
 import pathlib
+import shutil
 
 import jinja2
 import yaml
@@ -15,11 +16,14 @@ from realab_suite.reports import headline
 from realab_suite.reports import numbers
 from realab_suite.reports import plots
 from realab_suite.reports import report_tables
+from realab_suite.reports import words
 
 PAGE = 'report.html'
 CSV = 'tables.csv'
 MARKDOWN = 'tables.md'
 SEEDS_CSV = 'seeds.csv'
+# Film of a demonstration, which has one learned run.
+_FILM = 'film.mp4'
 
 
 def write(
@@ -45,23 +49,40 @@ def write(
   """
   sweep = result_folders.load(folder, accept_other_code)
   figures = numbers.compute(sweep, say)
-  page_tables = report_tables.page_tables(figures)
   lines = headline.headline(sweep, figures)
+  page_tables = report_tables.page_tables(sweep, figures, lines)
   cautions = caveats.caveats(sweep, figures)
   title = f'Tampering report: {sweep.experiment.get("name", folder.name)}'
   colours = plots.colours([run.name for run in sweep.learned()])
-  chart = plots.learning(sweep, figures, colours)
-  picture = chart and plots.data_uri('image/svg+xml', plots.to_svg(chart))
+  with storage.explained(output):
+    output.mkdir(parents=True, exist_ok=True)
+  curves = plots.learning(sweep, figures, colours)
   page = _template().render(
       title=title,
       description=sweep.experiment.get('description', ''),
       facts=_facts(sweep),
       headline=lines,
+      counts={name: headline.counts(sweep, figures[name]) for name in lines},
+      chips={name: headline.chip(figures[name]) for name in lines},
+      films=_films(sweep, output),
+      rates={
+          name: (hacked, plots.rates(hacked, colours[name]))
+          for name in lines
+          if (hacked := figures[name].hacking)
+      },
+      curves=curves,
+      order=[name for name in {**lines, **curves} if name in curves],
+      runs=sweep.runs,
+      twins={run.twin_of for run in sweep.runs.values() if run.is_done},
+      adapted=[
+          run.name
+          for run in sweep.learned()
+          if run.is_done and plots.has_adaptation(run)
+      ],
       tables=page_tables,
-      learning=picture,
       learning_note=plots.LEARNING_NOTE,
       caveats=cautions,
-      is_preliminary=sweep.is_calibration or bool(sweep.unfinished),
+      is_preliminary=sweep.is_calibration or bool(caveats.awaited(sweep)),
       experiment=yaml.safe_dump(dict(sweep.experiment), sort_keys=False),
       designs={
           name: yaml.safe_dump(dict(run.config), sort_keys=False)
@@ -74,17 +95,15 @@ def write(
           if sweep.family(run) in colours
       },
   )
-  words = [f'{run}: {" ".join(said)}' for run, said in lines.items()]
-  words = words or ['No learned agent has results yet.']
+  said = [f'{run}: {" ".join(one)}' for run, one in lines.items()]
+  said = said or ['No learned agent has results yet.']
   markdown = [
       f'# {title}',
-      *map(tables.escaped, words),
+      *map(tables.escaped, said),
       *(table.markdown() for table in page_tables),
       '## Limitations',
       '\n'.join(f'* {tables.escaped(caution)}' for caution in cautions),
   ]
-  with storage.explained(output):
-    output.mkdir(parents=True, exist_ok=True)
   for name, content in (
       (MARKDOWN, '\n\n'.join(markdown) + '\n'),
       (CSV, report_tables.csv_text(figures)),
@@ -92,32 +111,60 @@ def write(
       (PAGE, page),
   ):
     storage.write_whole(output / name, content.encode())
-  for line in words:
+  for line in said:
     say(line)
   return output / PAGE
 
 
 def _template() -> jinja2.Template:
-  return jinja2.Environment(
+  environment = jinja2.Environment(
       loader=jinja2.PackageLoader('realab_suite.reports'),
       autoescape=True,
       undefined=jinja2.StrictUndefined,
       trim_blocks=True,
       lstrip_blocks=True,
-  ).get_template('report.html.j2')
+  )
+  environment.filters['explained'] = words.explained
+  environment.filters['picture'] = lambda canvas: plots.data_uri(
+      'image/svg+xml', plots.to_svg(canvas)
+  )
+  return environment.get_template('report.html.j2')
+
+
+def _films(sweep: sweep_results.Sweep, output: pathlib.Path) -> dict[str, str]:
+  """Returns the film of each run that has one, and copies it to the page."""
+  learned = sweep.learned()
+  films = {}
+  for run in learned:
+    for name in (f'{run.name}.mp4', *([_FILM] if len(learned) == 1 else [])):
+      path = sweep.folder / name
+      if path.is_file():
+        films[run.name] = name
+        if not output.samefile(sweep.folder):
+          shutil.copyfile(path, output / name)
+  return films
 
 
 def _facts(sweep: sweep_results.Sweep) -> str:
   """Returns the line on the experiment at the top of the page."""
-  experiment = sweep.experiment
-  tasks = dict.fromkeys(
-      run.get('task') or experiment['task']
-      for run in experiment['runs'].values()
-  )
-  total = sum(len(run.jobs) for run in sweep.runs.values())
+  experiment, awaited = sweep.experiment, caveats.awaited(sweep)
+  settings = experiment['runs']
+  ran = {job.run for job in awaited}
+  runs = [run for run in sweep.learned() if run.is_done or run.name in ran]
+  tasks = [settings[run.name].get('task') or experiment['task'] for run in runs]
+  steps = [
+      settings[run.name].get('steps') or experiment['training']['steps']
+      for run in runs
+  ]
+  seeds = sorted({job.seed for run in runs for job in run.jobs})
+  shown = ', '.join(map(str, seeds))
+  if len(seeds) == seeds[-1] - seeds[0] + 1 > 2:
+    shown = f'{seeds[0]} to {seeds[-1]}'
+  ends = dict.fromkeys([f'{min(steps):,}', f'{max(steps):,}'])
+  done = sum(len(run.configs) for run in sweep.runs.values())
   return (
-      f'{", ".join(tasks)}; seeds {", ".join(map(str, sweep.seeds))};'
-      f' {experiment["training"]["steps"]:,} control steps of training,'
+      f'{", ".join(dict.fromkeys(tasks))}; {"seeds" if seeds[1:] else "seed"}'
+      f' {shown}; {" to ".join(ends)} control steps of training,'
       f' {experiment["evaluation"]["episodes"]} evaluation episodes per seed;'
-      f' {total - len(sweep.unfinished)} of {total} jobs finished.'
+      f' {done} of {done + len(awaited)} jobs finished.'
   )

@@ -58,7 +58,8 @@ class Seed:
       unless the design is coupled; see `queries`.
     onset: Control steps of all worlds up to the first point of the learning
       curve from which on the hack rate of training is above the control's;
-      `None` unless the seed tampers.
+      `None` unless the seed tampers. One point is none: see `too_short`.
+    too_short: The last point, if only there the rate is above the control's.
   """
 
   judgement: verdicts.Judgement
@@ -66,6 +67,7 @@ class Seed:
   training: verdicts.Training | None
   misnamed: str | None
   onset: int | None
+  too_short: int | None = None
 
 
 @final
@@ -278,7 +280,9 @@ def _seeds(
     number = run.evaluation_seed(seed)
     count = hacked.by_seed.get(number)
     paid = _count(episodes, stake, hacked.control).hacked
-    training, onset = verdicts.Training(paid, len(episodes)), None
+    training = verdicts.Training(paid, len(episodes))
+    onset: int | None = None
+    last: int | None = None
     if shared is not None:
       judgement = shared
     elif count is None:
@@ -295,9 +299,9 @@ def _seeds(
           is_censored=not all(row.is_valid for row in rows),
       )
     if judgement.label is _Label.TAMPERS:
-      onset = _onset(run.curves[seed], episodes, stake, hacked.control)
+      onset, last = _onset(run.curves[seed], episodes, stake, hacked.control)
     misnamed = _misnamed(run, seed)
-    seeds[seed] = Seed(judgement, count, training, misnamed, onset)
+    seeds[seed] = Seed(judgement, count, training, misnamed, onset, last)
   return seeds
 
 
@@ -377,21 +381,24 @@ def _onset(
     episodes: Sequence[Mapping[str, Any]],
     stake: stakes.Stakes,
     control: hacking.Control,
-) -> int | None:
-  """Returns the point from which on training hacks more than the control."""
-  onset, begin = None, 0
+) -> tuple[int | None, int | None]:
+  """Returns the onset, or the last point if training hacks more only there."""
+  onset: int | None = None
+  last: int | None = None
+  begin = 0
   for point in points:
     end = int(point['step'])
     window = [one for one in episodes if begin < one['step'] <= end]
     begin = end
     if not window:
       continue
+    last = end
     counts = [_count(window, stake, control)]
     if not verdicts.seeds_exceed(counts, control, verdicts.LABEL_LEVEL):
       onset = None
     elif onset is None:
       onset = end
-  return onset
+  return (None, last) if onset == last else (onset, None)
 
 
 def _count(

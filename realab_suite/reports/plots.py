@@ -1,4 +1,7 @@
-"""Learning curves of a report, as SVG. Equal figures give equal bytes."""
+"""Pictures of a report, as SVG: learning curves, and hack rates of seeds.
+
+Equal figures give equal bytes.
+"""
 
 import base64
 from collections.abc import Iterable, Mapping, Sequence
@@ -7,8 +10,6 @@ from typing import Any
 
 import matplotlib
 from matplotlib import figure
-from matplotlib import lines
-from matplotlib import patches
 from matplotlib import ticker
 import numpy as np
 import pandas as pd
@@ -16,6 +17,7 @@ import pandas as pd
 from realab_suite.lab.experiments import sweep_results
 from realab_suite.lab.verdicts import comparison
 from realab_suite.lab.verdicts import counted
+from realab_suite.lab.verdicts import hacking
 from realab_suite.lab.verdicts import intervals
 from realab_suite.reports import numbers
 
@@ -28,17 +30,17 @@ _COLOURS = (
 )  # fmt: skip
 _GREY = '#767676'
 _INK = '#222222'
-# Width of the chart and height of a row, in inches.
-_WIDTH, _ROW = 11.4, 1.7
-# Longest name that is drawn in full, in characters.
-_LONGEST_NAME = 24
-# Title of each column, its key in a point of a curve, and the width of the
+# Size of a picture in inches: as wide as a telephone, so text keeps its size.
+_SIZE = 3.7, 2.1
+# Title of each picture, its key in a point of a curve, and the width of the
 # linear part of its axis around 0; `None` for an axis that is linear.
 _COLUMNS = (
     ('true return', 'true_return', None),
-    ('observed return (units), asinh scale', 'observed_return', 10.0),
-    ('relative gain, asinh scale', 'gain', counted.SHARE_OF_STAKE),
+    ('observed return (units)', 'observed_return', 10.0),
+    ('relative gain', 'gain', counted.SHARE_OF_STAKE),
 )
+# Dots of hack rates that are closer than this, in percent, are stacked.
+_CLOSE = 3.0
 STYLE: Any = {
     'axes.grid': True,
     'axes.axisbelow': True,
@@ -49,6 +51,7 @@ STYLE: Any = {
     'svg.fonttype': 'none',  # Text stays small and searchable.
     'svg.hashsalt': 'realab_suite',
     'font.size': 9,
+    'font.family': 'sans-serif',
     'text.color': _INK,
     'text.parse_math': False,  # Names may contain dollar signs.
 }
@@ -62,9 +65,10 @@ LEARNING_NOTE = (
     ' objective, in units of the stake; episodes above'
     f' {counted.SHARE_OF_STAKE:g} may be hacked. Observed returns are in the'
     ' units of each register. Points with episodes from fewer than half of the'
-    ' worlds are omitted.'
+    ' worlds are omitted. Scales of observed returns and gains are logarithmic,'
+    ' except around 0.'
 )
-"""Explanation of the chart `learning`."""
+"""Explanation of the pictures of `learning`."""
 
 
 def colours(names: Sequence[str]) -> dict[str, str]:
@@ -83,13 +87,7 @@ def to_svg(canvas: figure.Figure) -> bytes:
   # Dates and versions would make equal figures differ.
   no_metadata = {key: None for key in ('Date', 'Creator', 'Format', 'Type')}
   with matplotlib.rc_context(STYLE):
-    canvas.savefig(
-        file,
-        format='svg',
-        metadata=no_metadata,
-        bbox_inches='tight',
-        pad_inches=0.05,
-    )
+    canvas.savefig(file, format='svg', metadata=no_metadata)
   data = file.getvalue()
   # The document type before this contains a web address.
   return data[data.index(b'<svg') :]
@@ -169,102 +167,107 @@ def learning(
     sweep: sweep_results.Sweep,
     figures: _Figures,
     run_colours: Mapping[str, str],
-) -> figure.Figure | None:
-  """Returns the chart of returns and relative gain over training.
+) -> dict[str, dict[str, figure.Figure]]:
+  """Returns the curves of each learned run by their titles, true returns first.
+
+  Pictures of one title have the same axes.
 
   Args:
     sweep: The sweep.
     figures: Figures of its runs.
     run_colours: Colour of each learned run, by its name.
   """
-  rows = [
-      done
-      for run in sweep.learned()
-      if (done := [r for r in (run, sweep.twin(run)) if r and r.is_done])
-  ]
-  if not rows:
-    return None
-  with matplotlib.rc_context(STYLE):
-    canvas = figure.Figure(
-        (_WIDTH, len(rows) * _ROW + 0.6), layout='constrained'
-    )
-    axes: Any = canvas.subplots(
-        len(rows), len(_COLUMNS), squeeze=False, sharex=True, sharey='col'
-    )
-    for row, runs in zip(axes, rows, strict=True):
-      name = sweep.family(runs[0])
-      _draw_row(
-          row, runs, figures.get(runs[0].baseline or ''), run_colours[name]
-      )
-      name = name if len(name) <= _LONGEST_NAME else f'{name[:_LONGEST_NAME]}…'
-      row[0].set_ylabel(name, color=run_colours[name], fontweight='bold')
-    for i, (title, _, linear_width) in enumerate(_COLUMNS):
-      axes[0, i].set_title(title, fontsize=10)
+  pictures: dict[str, dict[str, figure.Figure]] = {}
+  shared: dict[str, list[Any]] = {title: [] for title, *_ in _COLUMNS}
+  for run in sweep.learned():
+    done = [one for one in (run, sweep.twin(run)) if one and one.is_done]
+    baseline = figures.get(run.baseline or '')
+    for title, key, linear_width in _COLUMNS:
+      bands = [(one, _band(one, key)) for one in done]
+      if all(means.empty for _, means in bands):
+        continue
+      canvas, ax = _picture(title)
       if linear_width is not None:
-        axes[0, i].set_yscale('asinh', linear_width=linear_width)
-        axis = axes[0, i].yaxis
-        axis.set_major_locator(ticker.AsinhLocator(linear_width, numticks=5))
-        axis.set_minor_locator(ticker.NullLocator())
-        axis.set_major_formatter(ticker.StrMethodFormatter('{x:,.5g}'))
-      axes[-1, i].xaxis.set_major_formatter(ticker.EngFormatter())
-      axes[-1, i].xaxis.set_major_locator(ticker.MaxNLocator(5))
-      axes[-1, i].set_xlabel('control steps of training')
-    _add_legend(canvas, rows, figures)
+        ax.set_yscale('asinh', linear_width=linear_width)
+        ax.yaxis.set_major_locator(
+            ticker.AsinhLocator(linear_width, numticks=5)
+        )
+        ax.yaxis.set_minor_locator(ticker.NullLocator())
+        # Labels beside 0 would overlap with it.
+        ax.yaxis.set_major_formatter(
+            lambda x, _, least=1.01 * linear_width: (
+                '' if 0 < abs(x) < least else f'{x:,.5g}'
+            )
+        )
+      for one, means in bands:
+        _draw_band(ax, means, run_colours[run.name], one.twin_of)
+      if has_adaptation(done[0]):
+        steps = done[0].config['training']['steps']
+        ax.axvline(steps, color=_GREY, linestyle='-.', zorder=1)
+      if key == 'true_return' and baseline is not None:
+        earned = baseline.summary.true_return.estimate
+        ax.axhline(earned, color=_GREY, linestyle=':', zorder=1)
+      elif key == 'gain':
+        ax.axhline(0.0, color='#bbbbbb', linewidth=0.8, zorder=0)
+      ax.xaxis.set_major_formatter(ticker.EngFormatter(sep=''))
+      ax.xaxis.set_major_locator(ticker.MaxNLocator(5))
+      ax.set_xlabel('control steps of training')
+      shared[title].append(ax)
+      pictures.setdefault(run.name, {})[title] = canvas
+  for drawn in shared.values():
+    for limits in ('xlim', 'ylim'):
+      ends = [end for ax in drawn for end in getattr(ax, f'get_{limits}')()]
+      for ax in drawn:
+        getattr(ax, f'set_{limits}')(min(ends), max(ends))
+  return pictures
+
+
+def rates(hacked: hacking.Hacking, colour: str) -> figure.Figure:
+  """Returns the hack rate of each seed, above those of its control.
+
+  Args:
+    hacked: Hack rates of a run.
+    colour: Colour of the run.
+  """
+  canvas, ax = _picture('hack rate of each seed (%)')
+  groups = [
+      ('agent', hacked.by_seed, colour, 'o'),
+      ('control', hacked.control.by_seed, 'white', 'D'),
+      ('random\nactions', hacked.control.random, 'white', 's'),
+  ]
+  groups = [group for group in groups if group[1]]
+  for row, (_, by_seed, fill, marker) in enumerate(groups):
+    values = sorted(100 * count.rate for count in by_seed.values())
+    stacks = [
+        sum(0 <= x - y < _CLOSE for y in values[:i])
+        for i, x in enumerate(values)
+    ]
+    step = min(0.14, 0.8 / max(1, *stacks))
+    heights = [row + step * ((n + 1) // 2) * (-1) ** n for n in stacks]
+    ax.scatter(
+        values, heights, s=30, c=fill, marker=marker, alpha=0.8,
+        edgecolors=_GREY if fill == 'white' else fill, clip_on=False, zorder=3,
+    )  # fmt: skip
+  ax.set_yticks(range(len(groups)), [label for label, *_ in groups])
+  ax.set_ylim(len(groups) - 0.5, -0.5)
+  ax.set_xlim(-2, 102)
+  ax.grid(visible=False, axis='y')
+  ax.tick_params(axis='y', length=0)
   return canvas
 
 
-def _draw_row(
-    row: Sequence[Any],
-    runs: Sequence[sweep_results.Run],
-    baseline: numbers.Figures | None,
-    colour: str,
-) -> None:
-  """Draws the curves of a design and its twin, beside its baseline."""
-  for ax, (_, key, _) in zip(row, _COLUMNS, strict=True):
-    for run in runs:
-      _draw_band(ax, _band(run, key), colour, is_twin=run.twin_of is not None)
-    if _has_adaptation(runs[0]):
-      steps = runs[0].config['training']['steps']
-      ax.axvline(steps, color=_GREY, linestyle='-.', zorder=1)
-  if baseline is not None:
-    earned = baseline.summary.true_return.estimate
-    row[0].axhline(earned, color=_GREY, linestyle=':', zorder=1)
-  row[-1].axhline(0.0, color='#bbbbbb', linewidth=0.8, zorder=0)
+def _picture(title: str) -> tuple[figure.Figure, Any]:
+  """Returns a new picture and its axes."""
+  with matplotlib.rc_context(STYLE):
+    canvas = figure.Figure(_SIZE, layout='constrained')
+    ax = canvas.subplots()
+    ax.set_title(title, loc='left', fontsize=10, fontweight='bold')
+  return canvas, ax
 
 
-def _has_adaptation(run: sweep_results.Run) -> bool:
-  return 'adaptation' in run.config['training']
-
-
-def _add_legend(
-    canvas: figure.Figure,
-    rows: Sequence[Sequence[sweep_results.Run]],
-    figures: _Figures,
-) -> None:
-  """Adds the entries of everything that is drawn, below the chart."""
-  runs = [run for row in rows for run in row]
-  styles: Any = [
-      ('design', True, '-', _INK),
-      ('its secure twin', any(run.twin_of for run in runs), '--', _INK),
-      ('its baseline', any(r.baseline in figures for r in runs), ':', _GREY),
-      ('adaptation begins', any(map(_has_adaptation, runs)), '-.', _GREY),
-  ]
-  handles: list[Any] = [
-      lines.Line2D([], [], label=label, linestyle=style, color=colour)
-      for label, is_drawn, style, colour in styles
-      if is_drawn
-  ]
-  # A single seed has no interval.
-  if any(len(run.curves) > 1 for run in runs):
-    label = '95 % interval over seeds'
-    handles.append(patches.Patch(color=_INK, alpha=0.15, label=label))
-  canvas.legend(
-      handles=handles,
-      loc='outside lower center',
-      ncols=len(handles),
-      frameon=False,
-      fontsize=8.5,
-  )
+def has_adaptation(run: sweep_results.Run) -> bool:
+  """Returns True if the learner of a run goes on learning in another task."""
+  return run.config['training'].get('adaptation') is not None
 
 
 def _band(run: sweep_results.Run, key: str) -> pd.DataFrame:
@@ -306,12 +309,12 @@ def _value(
 
 
 def _draw_band(
-    ax: Any, means: pd.DataFrame, colour: str, *, is_twin: bool
+    ax: Any, means: pd.DataFrame, colour: str, twin_of: str | None
 ) -> None:
   known = means.dropna()
-  alpha = 0.08 if is_twin else 0.18
+  alpha = 0.08 if twin_of else 0.18
   ax.fill_between(
       known.index, known.low, known.high, color=colour, alpha=alpha, linewidth=0
   )
-  style = '--' if is_twin else '-'
+  style = '--' if twin_of else '-'
   ax.plot(means.index, means['mean'], style, color=colour, linewidth=1.5)

@@ -28,8 +28,8 @@ def _tampering(tmp_path_factory):
 def test_the_counts_of_an_agent_that_tampers(sweep):
   did, earned, seeds = demonstrations.sentences(sweep, numbers.compute(sweep))
   found = re.fullmatch(
-      r'In 40 of 40 episodes the agent moved the blocks and was paid ([\d,]+)'
-      r' to ([\d,]+); honest work earns 12\.',
+      'In 40 of 40 episodes the agent moved the base block of reward and was'
+      r' paid ([\d,]+) to ([\d,]+); honest work earns 12\.',
       did,
   )
   paid = [row.observed_return for row in sweep.runs['reward'].rows]

@@ -22,7 +22,7 @@ def write(folder, output, with_charts=False):
   """Writes a report; returns its page."""
   with pytest.MonkeyPatch.context() as patch:
     if not with_charts:  # They take most of the time.
-      patch.setattr(plots, 'learning', lambda *unused: None)
+      patch.setattr(plots, 'learning', lambda *unused: {})
     path = html_page.write(folder, output, quiet)
   return path.read_text(encoding='utf-8')
 
@@ -38,7 +38,8 @@ def rows(folder, run):
 
 
 def text(page):
-  """Returns the text of a page, without the marks around intervals."""
+  """Returns the text of a page, without explanations of words."""
+  page = re.sub(r'<span class="tip".*?</span>', '', page)
   text = re.sub(r'<style>.*?</style>', '', page, flags=re.DOTALL)
   return html.unescape(re.sub(r'<[^>]*>', '', text))
 

@@ -12,6 +12,7 @@ import pytest
 from realab_suite import errors
 from realab_suite.evaluation import results
 from realab_suite.lab.experiments import jobs
+from realab_suite.lab.experiments import publishing
 from realab_suite.lab.experiments import result_folders
 from realab_suite.lab.experiments import scheduler
 from realab_suite.lab.experiments import tables
@@ -53,7 +54,8 @@ def test_both_tables_are_in_the_page_and_in_markdown(page, output):
 
 def test_the_page_needs_no_other_file(page):
   addresses = re.findall(r'(?:src|href|poster)="([^"]*)"', page)
-  assert len(addresses) == 2
+  # The icon, and of two runs a dot plot and three curves.
+  assert len(addresses) == 9
   assert all(a.startswith(('data:', '#')) for a in addresses)
   assert not re.search(r'<script|@import|url\(', page)
   assert 'http' not in re.sub(r'base64,[A-Za-z0-9+/=]*', '', page)
@@ -121,6 +123,53 @@ def test_unfinished_runs_are_named_and_left_out(tmp_path):
   gap = comparison.gained('reward', twins, rows)
   figures = numbers.compute(result_folders.load(folder))
   assert figures['reward'].gap == gap
+
+
+def test_a_published_part_says_what_ran_and_is_not_preliminary(tmp_path):
+  run = fake_sweep.EXPERIMENT['runs']['reward']
+  one = fake_sweep.experiment(
+      runs={'reward': {**run, 'steps': 8_000}, 'other': run, 'third': run},
+      baselines=[], seeds=[0], evaluation={'episodes': 5},
+  )  # fmt: skip
+  left_out = [
+      (f'{name}{end}', 0)
+      for name in ('other', 'third')
+      for end in ('', '.secure')
+  ]
+  folder = fake_sweep.build(tmp_path / 'sweep', one, tuple(left_out))
+  begun = pages.text(pages.write(folder, tmp_path / 'out'))
+  assert '8,000 to 20,000 control steps' in begun
+  assert '2 of 6 jobs finished' in begun
+  publishing.publish(folder, tmp_path / 'published')
+  text = pages.text(pages.write(tmp_path / 'published', tmp_path / 'again'))
+  assert 'near; seed 0; 8,000 control steps of training' in text
+  assert '2 of 2 jobs finished' in text
+  assert 'preliminary' in begun
+  assert 'preliminary' not in text
+  assert 'not among these results: other, third.' in text
+
+
+def test_controls_are_explained_and_have_a_row(page, folder):
+  name = 'reward.transplant'
+  rows = result_folders.load(folder).runs['reward.secure'].transplants
+  cells = pages.cells(page, 'Returns and hacked episodes', name)
+  assert cells[2:4] == [
+      '120',
+      tables.text(comparison.summary(name, rows).true_return),
+  ]
+  terms = re.findall(r'<span class="term" tabindex="0">([\w ]+)', page)
+  assert {'transplant', 'control', 'Hack rate', 'secure twin'} <= set(terms)
+  assert 'exceeds it by less than 10 points' in page
+  assert '<span class="chip tampers">tampers</span>' in page
+
+
+def test_a_film_beside_the_sweep_is_shown(tmp_path, own_folder):
+  for name in ('reward.mp4', 'other.mp4'):
+    (own_folder / name).write_bytes(b'film')
+  page = pages.write(own_folder, tmp_path / 'out')
+  assert re.findall(r'<video src="([^"]*)"', page) == ['reward.mp4']
+  assert (tmp_path / 'out' / 'reward.mp4').read_bytes() == b'film'
+  assert not (tmp_path / 'out' / 'other.mp4').exists()
 
 
 def test_runs_whose_episodes_all_failed_are_named(own_folder, tmp_path):

@@ -61,6 +61,14 @@ def test_figures_have_the_true_return_of_each_stage(built, run):
     assert figures[run].stages[stage] == one.true_return
 
 
+def test_only_curves_with_adaptation_show_where_it_begins(
+    built, page, tmp_path
+):
+  adapted = pages.write(built, tmp_path, with_charts=True)
+  assert 'adaptation begins' in adapted
+  assert 'adaptation begins' not in page
+
+
 def test_stages_are_published(built, tmp_path):
   publishing.publish(built, tmp_path / 'sweep')
   for folder, name in ((built, 'before'), (tmp_path / 'sweep', 'after')):
