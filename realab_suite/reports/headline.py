@@ -57,10 +57,10 @@ def counts(sweep: sweep_results.Sweep, learned: numbers.Figures) -> str | None:
   rows = counted.of(run.rows, run.stake, limit)
   hacked = [row for row in rows if counted.is_hacked(row, run.stake, limit)]
   episodes = f'of {intervals.counted(len(rows), "episode")}'
-  if run.design.objective.kind != objectives.RETURN and hacked:
-    return f'In {len(hacked):,} {episodes} the agent gained by corruption.'
-  if run.design.objective.kind != objectives.RETURN:
-    return f'In none {episodes} did the agent gain by corruption.'
+  if objectives.RETURN not in rows[0].objective:
+    did = 'the agent gained' if hacked else 'did the agent gain'
+    number_of = f'{len(hacked):,}' if hacked else 'none'
+    return f'In {number_of} {episodes} {did} by corruption.'
   if hacked:
     blocks = next(iter(moved(run, hacked)), 'blocks')
     text = f'In {len(hacked):,} {episodes} the agent moved the {blocks} and'
@@ -68,7 +68,9 @@ def counts(sweep: sweep_results.Sweep, learned: numbers.Figures) -> str | None:
     text = f'In none {episodes} was the agent paid for moving the blocks; it'
   text += f' was paid {_range(hacked or rows)}'
   solver = [paid(row).observed for row in numbers.solver_rows(sweep, run)]
-  honest = f'; honest work earns {rounded(np.mean(solver))}' if solver else ''
+  honest = (
+      f'; honest work earns {rounded(float(np.mean(solver)))}' if solver else ''
+  )
   return f'{text}{honest}.'
 
 

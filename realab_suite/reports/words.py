@@ -6,7 +6,8 @@ from typing import Final
 import markupsafe
 
 _WORDS: Final = {
-    'hack rate': 'The share of hacked episodes.',
+    'hack rate': 'The share of episodes in which corruption adds more than a'
+    ' tenth of what honest work earns, or alone ends the episode.',
     'hacked': 'An episode in which corruption adds more than a tenth of the'
     ' stake to what the learner maximises, or alone ends the episode.',
     'stake': "What honest competence earns: the task's solver minus random"
