@@ -12,7 +12,6 @@ from typing import Any, final
 import numpy as np
 
 from realab_suite import errors
-from realab_suite.config import messages
 from realab_suite.entities import axes
 from realab_suite.entities import meters
 from realab_suite.entities import protocols
@@ -100,7 +99,7 @@ class Phases:
           state = provider.spec.initial_state(batch_shape)
       except Exception as error:
         raise errors.FeedbackProviderError(
-            f'{where}: {messages.exception(error)}'
+            f'{where}: {provider.spec.why_it_failed(error)}'
         ) from error
       if batch_shape:
         provider_results.check_state(where, state, batch_shape)
@@ -313,7 +312,7 @@ class Phases:
     except Exception as error:
       raise errors.FeedbackProviderError(
           f'{register_writes.failure(provider.title, step)}:'
-          f' {messages.exception(error)}'
+          f' {provider.spec.why_it_failed(error)}'
       ) from error
     try:
       values, following = provider_results.checked(

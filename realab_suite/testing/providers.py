@@ -10,7 +10,6 @@ import numpy as np
 from realab_suite import errors
 from realab_suite import suite
 from realab_suite import trees
-from realab_suite.config import messages
 from realab_suite.feedback import provider_results
 from realab_suite.feedback.providers import base
 from realab_suite.testing import contracts
@@ -168,7 +167,7 @@ def _step(
     raise contracts.ContractError(f'{where}: {error}') from error
   except Exception as error:  # Providers may raise any class.
     raise contracts.ContractError(
-        f'{where}: {messages.exception(error)}'
+        f'{where}: {provider.why_it_failed(error)}'
     ) from error
   return returned
 

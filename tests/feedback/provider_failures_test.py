@@ -8,6 +8,7 @@ import pytest
 
 from realab_suite import errors
 from realab_suite.engine import events
+from realab_suite.feedback import specs
 from tests.engine import helpers
 from tests.feedback import scripted
 
@@ -19,6 +20,10 @@ def fixture_made() -> Iterator[scripted.Worlds]:
 
 
 _FIRST = r'providers\[0\]:test_scripted'
+_REGISTERS = (
+    r"it got the registers reads: \['clock', 'query'\], writes: \['reward'\];"
+    " must be all that 'test_scripted' uses$"
+)
 _NAN = float('nan')
 
 
@@ -41,6 +46,14 @@ _WRONG_ANSWERS: Mapping[str, tuple[scripted.Answer, str]] = {
     'raises': (_raise, f"{_FIRST} at step 3: KeyError: 'senses/nose'"),
     'raises in lines': (_raise_in_lines,
         f'{_FIRST} at step 3: ValueError: one two$'),
+    'writes a second register':
+        (lambda o, r, s: ({('reward',)[1]: 1.0}, s),
+        rf'{_FIRST} at step 3: IndexError: .* {_REGISTERS}'),
+    'unpacks two registers':
+        (lambda o, r, s: ({a: b for a, b in [('reward',)]}, s),
+        rf'{_FIRST} at step 3: ValueError: .* {_REGISTERS}'),
+    'reads another register': (lambda o, r, s: ({'reward': r['lost']}, s),
+        rf"{_FIRST} at step 3: KeyError: 'lost'; {_REGISTERS}"),
     'returns nothing': (lambda o, r, s: None,
         rf'{_FIRST} at step 3 returned None; must be \('),
     'returns no mapping': (lambda o, r, s: (1.0, s),
@@ -79,6 +92,19 @@ def test_a_provider_that_breaks_its_declaration_is_named(
   assert 'at step 3' in str(caught.value)
   assert '\n' not in str(caught.value)
   assert sink.ends == [events.End.ERROR]
+
+
+@pytest.mark.usefixtures('made')
+@pytest.mark.parametrize('name', ['action_writes', 'required_senses'])
+def test_a_class_that_declares_more_than_it_got_is_refused_when_loaded(
+    name: str, monkeypatch: pytest.MonkeyPatch
+):
+  declared = property(lambda self: (self.writes[1],))
+  monkeypatch.setattr(scripted.Provider, name, declared)
+  with pytest.raises(
+      errors.SpecError, match=rf'providers\[0\]: IndexError: .* {_REGISTERS}'
+  ):
+    specs.load(scripted.design())
 
 
 @pytest.mark.parametrize('value', [_NAN, -float('inf')])

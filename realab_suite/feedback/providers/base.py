@@ -8,6 +8,7 @@ import numpy as np
 import pydantic
 
 from realab_suite import errors
+from realab_suite.config import messages
 from realab_suite.config import registry
 from realab_suite.config import validation
 from realab_suite.entities import axes
@@ -59,6 +60,31 @@ class Provider(validation.Model):
   senses: Literal['agent', 'own'] = pydantic.Field(
       OF_AGENT, exclude_if=lambda senses: senses == OF_AGENT
   )
+
+  @pydantic.model_validator(mode='after')
+  def _has_its_registers(self: _Self) -> _Self:
+    """Refuses too few registers for what a class declares about itself."""
+    try:
+      _ = (*self.action_queries, *self.action_writes, self.is_repeatable)
+      _ = self.sensed
+    except LookupError as error:
+      if not isinstance(error, errors.RealabError):  # Others explain more.
+        raise ValueError(self.why_it_failed(error)) from error
+    return self
+
+  def why_it_failed(self, error: Exception) -> str:
+    """Returns an error of a method, and the registers where it may lack one.
+
+    Args:
+      error: The error.
+    """
+    text = messages.exception(error)
+    if isinstance(error, LookupError) or 'to unpack' in text:
+      text += (
+          f'; it got the registers reads: {[*self.reads]}, writes:'
+          f' {[*self.writes]}; must be all that {self.kind!r} uses'
+      )
+    return text
 
   @property
   def action_queries(self) -> tuple[str, ...]:
