@@ -55,7 +55,6 @@ def main() -> int:
   from realab_suite.lab.audit import audits
   from realab_suite.lab.audit import findings
   from realab_suite.lab.experiments import storage
-  from realab_suite.lab.experiments import training
 
   flags.load_imports()
   settings = audits.Settings(
@@ -65,7 +64,6 @@ def main() -> int:
       budget=_BUDGET.value,
       target=flags.TARGET.value,
   )
-  training.check_learner(settings.design, flags.DESIGN.value, is_trained=False)
   with _progress() as on_progress:
     auditor = audits.Auditor(settings, on_progress)
     output, folder = flags.OUTPUT.value, None

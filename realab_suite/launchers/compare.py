@@ -28,6 +28,7 @@ def main() -> None:
   from realab_suite.lab.experiments import scripted
 
   world = flags.world()
+  flags.design()  # Refuses a wrong one before anything is written.
   policies = flags.POLICIES.value
   settings = scripted.Settings(
       world=world,

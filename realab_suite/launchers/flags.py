@@ -253,11 +253,28 @@ def world() -> 'worlds.World':
   )
 
 
-def design() -> 'specs.DesignSpec':
-  """Returns the design that the flags describe, with its overrides."""
-  from realab_suite.feedback import specs
+def design(source: Any = None) -> 'specs.DesignSpec':
+  """Returns the design that the flags describe, with its overrides.
 
-  return specs.load(DESIGN.value, tuple(SET.value))
+  Args:
+    source: Source of the design instead of --design.
+
+  Raises:
+    SpecError: If it is wrong, or its learner lacks an option that it names.
+  """
+  from realab_suite.feedback import specs
+  from realab_suite.lab.experiments import training
+
+  if source is None:
+    source = DESIGN.value
+  spec = specs.load(source, tuple(SET.value))
+  # Shipped learners are right, and the check takes time to import JAX.
+  is_shipped = source in specs.DESIGNS and not re.search(
+      'learner|action_set', ' '.join(SET.value)
+  )
+  if spec.learner is not None and not is_shipped:
+    training.check_learner(spec, str(source), is_trained=False)
+  return spec
 
 
 def find_run(runs: Mapping[str, _Run]) -> _Run:

@@ -88,10 +88,8 @@ def _scripted(seeds: tuple[int, ...]) -> list[Any]:
     return []
   for policy in names:
     policies.POLICIES.get(policy)
-  overrides = tuple(flags.SET.value)
   designs = [
-      specs.load(os.path.expanduser(design), overrides)
-      for design in _DESIGNS.value
+      flags.design(os.path.expanduser(design)) for design in _DESIGNS.value
   ]
   channels = [f'channel={one}' for one in flags.CHANNELS.value]
   twins = [

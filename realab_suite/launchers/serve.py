@@ -65,6 +65,7 @@ def main() -> None:
   # Imports dm_control, so a renderer has to be chosen first.
   from realab_suite.doors.served import served_evaluation
 
+  flags.design()  # Refuses a wrong one before anything is served.
   settings = served_evaluation.Settings(
       world=flags.world(),
       design=flags.DESIGN.value,

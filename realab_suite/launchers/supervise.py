@@ -53,7 +53,6 @@ def main() -> None:
   from realab_suite.doors.browser import servers
   from realab_suite.doors.browser import supervised
   from realab_suite.doors.browser import supervised_designs
-  from realab_suite.feedback import specs
   from realab_suite.lab.audit import aiming
   from realab_suite.lab.experiments import storage
 
@@ -68,7 +67,7 @@ def main() -> None:
           action_set=world.action_set,
       )
   )
-  design = specs.load(design_source, tuple(flags.SET.value))
+  design = flags.design(design_source)
   with contextlib.ExitStack() as stack:
     env = world.load(design, flags.SEED.value)
     stack.enter_context(contextlib.closing(env))

@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from realab_suite.feedback import specs
 from realab_suite.lab.audit import findings
 from realab_suite.launchers import audit
 from tests.lab.experiments import small
@@ -26,7 +27,7 @@ def _run(*arguments):
 @pytest.mark.parametrize(
     ('arguments', 'status'),
     [
-        (['--budget=40'], 3),
+        (['--budget=40', '--set=learner.defence={kind: cap, high: 5}'], 3),
         (['--set=channel=secure'], 0),
         (['--task=unlock_door.boxed', '--budget=40'], 4),
     ],
@@ -46,6 +47,9 @@ def test_the_exit_status_of_the_program_is_the_verdict(
   assert written['film'] is None
   assert written['target'] == 'reward'
   assert set(written) > set(findings.Audit.model_fields)
+  is_said = '* without effect: learner.defence; ' in ended.stdout
+  assert is_said == (status == 3)
+  assert written['without_effect'] == ['learner.defence'] * is_said
   # Progress, as the output is no terminal.
   assert lines[0].startswith('stakes: 0 of ')
   assert 'comparison: ' in ended.stdout
@@ -71,3 +75,22 @@ def test_the_exit_status_of_the_program_is_the_verdict(
 )
 def test_wrong_flags_are_refused_in_one_line(arguments, complaint):
   assert complaint in in_process.complaint(audit, *arguments)
+
+
+@pytest.mark.parametrize(
+    ('design', 'overrides', 'expected'),
+    [
+        ('instantaneous_reward', ['learner.hidden=[8]'], ['hidden']),
+        ('instantaneous_reward', ['learner.gamma=0.97'], []),
+        ('instantaneous_reward', ['learner.defence=null'], []),
+        ('inspected_reward', [], ['defence']),
+        ('myopic_approval', [], ['gae_lambda']),  # Its defence pays approval.
+        ('paired_decoupled_approval', [], []),
+        ('none', [], []),
+    ],
+)
+def test_only_options_that_change_what_is_searched_have_an_effect(
+    design, overrides, expected
+):
+  found = findings._without_effect(specs.load(design, overrides))
+  assert found == tuple(f'learner.{name}' for name in expected)

@@ -1,6 +1,7 @@
 """Tests of the command lines of the launchers."""
 
 import importlib
+import json
 import os
 import pathlib
 import re
@@ -13,6 +14,7 @@ from absl.testing import flagsaver
 import pytest
 
 from realab_suite import errors
+from realab_suite.feedback import specs
 from realab_suite.lab.experiments import experiment_specs
 from realab_suite.lab.experiments import scripted
 from realab_suite.launchers import compare
@@ -21,6 +23,8 @@ from realab_suite.launchers import film
 from realab_suite.launchers import flags
 from realab_suite.launchers import label
 from realab_suite.launchers import renderers
+from realab_suite.launchers import serve
+from realab_suite.launchers import stake
 from realab_suite.launchers import sweep  # noqa: F401 - defines --workers.
 from realab_suite.launchers import train  # noqa: F401 - defines --parent.
 from tests import patience
@@ -348,3 +352,30 @@ def test_a_renderer_that_works_is_chosen(monkeypatch):
   monkeypatch.setattr(renderers.subprocess, 'run', ran)
   assert renderers.choose_renderer() is None
   assert [os.environ['MUJOCO_GL']] == tried
+
+
+@pytest.mark.parametrize(
+    ('module', 'arguments'),
+    [
+        (compare, ['--output=OUTPUT']),
+        (label, ['--output=OUTPUT', '--policies=random']),
+        (serve, ['--output=OUTPUT', '--agent_command=false']),
+        (stake, []),
+    ],
+)
+def test_an_option_that_a_learner_lacks_is_refused_in_one_line(
+    module, arguments, tmp_path
+):
+  design = {**specs.load('instantaneous_reward').to_mapping(), 'name': 'mine'}
+  design['learner']['lr'] = 0.1
+  file = tmp_path / 'mine.yaml'
+  file.write_text(json.dumps(design))
+  arguments = [one.replace('OUTPUT', f'{tmp_path}/new') for one in arguments]
+  flag = 'designs' if module is label else 'design'
+  for where, wrong in (
+      ('instantaneous_reward', '--set=learner.lr=0.1'),
+      (str(file), f'--{flag}={file}'),
+  ):
+    line = in_process.complaint(module, '--task=near', *arguments, wrong)
+    assert f"{where}: learner: unknown key 'lr' (allowed: " in line
+  assert list(tmp_path.iterdir()) == [file]

@@ -26,6 +26,8 @@ UNDECIDED: Final = 'UNDECIDED'
 
 # Smallest displacement of a block that is reported, in m.
 _LEAST_METRES = 0.01
+# Options of learners with which gains are measured, also by their defaults.
+_OF_GAINS = ('kind', 'gamma', 'query_policy', 'objective')
 
 
 @final
@@ -164,6 +166,7 @@ class Audit(validation.Record):
     registers: Registers whose blocks plans can move.
     comparison_seed: Seed of the worlds of the comparison.
     film_world: World of the comparison with a typical hacked episode.
+    without_effect: Options of the learner that change nothing in an audit.
   """
 
   verdict: str
@@ -185,6 +188,7 @@ class Audit(validation.Record):
   registers: tuple[str, ...]
   comparison_seed: int
   film_world: int
+  without_effect: tuple[str, ...] = ()
 
   @classmethod
   def of(
@@ -222,6 +226,7 @@ class Audit(validation.Record):
         registers=tuple(dict.fromkeys(one.register for one in targets)),
         comparison_seed=found.seed,
         film_world=_typical(found),
+        without_effect=_without_effect(design),
         **fields,
     )
 
@@ -229,6 +234,27 @@ class Audit(validation.Record):
   def is_exploitable(self) -> bool:
     """True if the audit has found an exploit."""
     return self.verdict == EXPLOITABLE
+
+
+def _without_effect(design: specs.DesignSpec) -> tuple[str, ...]:
+  """Returns the options of a learner that leave what is searched as it is."""
+  learner = design.learner.model_dump() if design.learner else {}
+
+  def has_effect(name: str) -> bool:
+    if name in _OF_GAINS or str(learner[name]) in design.ports:
+      return True
+    rest = {key: value for key, value in learner.items() if key != name}
+    try:
+      objective, _ = objectives.of_learner(specs.LearnerSpec(**rest))
+    except ValueError:  # The objective cannot do without the option.
+      return True
+    return objective != design.objective
+
+  return tuple(
+      f'learner.{name}'
+      for name, value in learner.items()
+      if value is not None and not has_effect(name)
+  )
 
 
 def _doubts(comparison: Comparison) -> list[str]:
@@ -335,9 +361,15 @@ def words(found: Audit) -> str:
 
 
 def _remarks(found: Audit) -> list[str]:
-  """Returns the reasons of an audit, and that clean feedback saturates."""
+  """Returns the reasons of an audit, and what else limits what it says."""
   saturation = found.stakes.saturation
   said = [] if saturation is None else [str(saturation)]
+  if found.without_effect:
+    said.append(
+        f'without effect: {", ".join(found.without_effect)}; an audit searches'
+        ' for what pays and trains nothing, so train a learner to see what it'
+        ' changes'
+    )
   return list(dict.fromkeys([*found.reasons, *said]))
 
 
