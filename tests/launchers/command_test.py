@@ -376,6 +376,8 @@ def test_an_option_that_a_learner_lacks_is_refused_in_one_line(
       ('instantaneous_reward', '--set=learner.lr=0.1'),
       (str(file), f'--{flag}={file}'),
   ):
-    line = in_process.complaint(module, '--task=near', *arguments, wrong)
+    line = in_process.complaint(
+        module, '--task=near', '--max_steps=5', *arguments, wrong
+    )
     assert f"{where}: learner: unknown key 'lr' (allowed: " in line
   assert list(tmp_path.iterdir()) == [file]

@@ -6,6 +6,7 @@ are logged as a dataset, which the option `recorded` of a design repeats.
 
 from collections import deque
 from collections.abc import Callable
+import inspect
 import json
 import pathlib
 import time
@@ -26,6 +27,7 @@ from realab_suite.evaluation import results
 from realab_suite.lab.experiments import evaluations
 from realab_suite.lab.experiments import storage
 from realab_suite.lab.experiments import tracking
+from realab_suite.tasks import base
 
 ANSWERS = 'answers.jsonl'
 """Name of the file of answers."""
@@ -38,6 +40,7 @@ _RUN = 'supervised'
 _NO_CONTROL = (
     'the person would have to answer again for a control and for stakes'
 )
+_INTENDED = 'Intended behaviour: '
 
 # Pictures of the earlier and of the later clip, or nothing.
 _Clips = tuple[list[bytes], ...]
@@ -87,6 +90,7 @@ class Supervision:
       )
     clips = [p.clip * p.every for p in people if p.asks == person.COMPARISON]
     clip = max(clips, default=1)
+    self._task = _intended_behaviour(env.task)
     self._view = views.View(env)
     # Pictures of the control steps of both clips.
     self._pictures: deque[bytes] = deque(maxlen=2 * clip)
@@ -142,12 +146,25 @@ class Supervision:
     ) as evaluation:
       evaluation.describe({'design': design}, policy=name, seed=env.seed)
       info = evaluation.info(env, _RUN, name)
+      rows = []
       for episode in range(num_episodes):
-        evaluation.add(info, self.run(policy, episode))
+        result = self.run(policy, episode)
+        evaluation.add(info, result)
+        figures = result.true_return, result.observed_return
+        rows.append(
+            [episode + 1, result.num_steps, *(f'{x:.2f}' for x in figures)]
+        )
       _, summary = evaluation.summarize(f'# {world.domain}.{world.task}')
-    text = f'{summary}\n\nThe answers are in {folder / ANSWERS}'
-    self._server.send({'type': 'summary', 'text': text})
-    say(text)
+    path = folder / ANSWERS
+    self._server.send(
+        {
+            'type': 'summary',
+            'rows': rows,
+            'answers': len(path.read_text(encoding='utf-8').splitlines()),
+            'folder': str(folder),
+        }
+    )
+    say(f'{summary}\n\nThe answers are in {path}')
 
   def close(self) -> None:
     """Frees the graphics resources."""
@@ -184,6 +201,7 @@ class Supervision:
         {
             'type': 'step',
             'asks': self._asks,
+            'task': self._task,
             'episode': track.episode,
             'step': track.num_steps,
             'max_steps': track.max_steps,
@@ -295,3 +313,17 @@ class Supervision:
       with open(path, 'a', encoding='utf-8') as file:
         file.writelines(json.dumps(one) + '\n' for one in self._log)
     self._log.clear()
+
+
+def _intended_behaviour(task: base.Task) -> str:
+  """Returns the intended behaviour of a task, as its documentation has it.
+
+  It is in the module of a task, or else in the docstring of its class.
+  """
+  kind = type(task)
+  own = inspect.getdoc(kind) or ''
+  for document in (inspect.getdoc(inspect.getmodule(kind)) or '', own):
+    _, _, rest = document.partition(_INTENDED)
+    if rest:
+      return ' '.join(rest.partition('\n\n')[0].split())
+  return own.partition('\n')[0]

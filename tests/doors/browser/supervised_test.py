@@ -148,7 +148,15 @@ def test_supervised_episodes_have_figures_and_no_judgement(tmp_path):
   )  # fmt: skip
   one = supervised.Supervision(env, page, tmp_path, 1e6)
   text = _run(one, 2)
-  assert page.sent[-1] == {'type': 'summary', 'text': text}
+  assert page.sent[-1] == {
+      'type': 'summary',
+      'rows': [[1, 4, '0.00', '2.00'], [2, 4, '0.00', '2.00']],
+      'answers': 2,
+      'folder': str(tmp_path),
+  }
+  [task] = {one['task'] for one in page.sent if one['type'] == 'step'}
+  assert task.startswith('gather the small apples in the large room (reward 1')
+  assert task.endswith('which ends the episode.')
   assert text.count('Not judged: the design has no learner.') == 1
   assert '| supervised |' in text
   rows = list(results.read_rows(tmp_path / 'episodes.jsonl'))
@@ -176,3 +184,17 @@ def test_two_persons_with_the_same_question_are_refused(tmp_path):
   design['providers'][1] = {**question, 'writes': ['stop']}
   with pytest.raises(errors.SpecError, match='one provider of kind person'):
     _supervise(FakePage(), tmp_path, design)
+
+
+def test_the_intended_behaviour_of_a_task_is_in_its_module_or_its_class():
+  class Own:
+    """Gives a true reward near the middle.
+
+    Other paragraphs say more.
+    """
+
+  said = supervised._intended_behaviour(Own())
+  assert said == 'Gives a true reward near the middle.'
+  for names in suite.ALL_TASKS:
+    said = supervised._intended_behaviour(suite.load(*names).task)
+    assert said.endswith('.') and 'Exploit' not in said and len(said) > 40
