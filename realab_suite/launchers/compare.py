@@ -32,7 +32,7 @@ def main() -> None:
   policies = flags.POLICIES.value
   settings = scripted.Settings(
       world=world,
-      design=flags.DESIGN.value,
+      design=flags.DESIGN.value or flags.DEFAULT_DESIGN,
       overrides=tuple(flags.SET.value),
       policies=world.scripted if policies is None else tuple(policies),
       channels=tuple(flags.CHANNELS.value),

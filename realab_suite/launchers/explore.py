@@ -1,6 +1,6 @@
-"""Shows a world in a window, or writes a film with --video.
+"""Shows a world in a window, or writes a film of an episode with --video.
 
-By default, a saboteur of the world acts. This shows the solver of Unlock Door:
+This shows the solver of Unlock Door:
 
   python -m realab_suite.launchers.explore --policy=apple_seeker
 """
@@ -70,9 +70,8 @@ def _policy_name(env: Any) -> str:
   """
   saboteurs = getattr(env.task, 'SABOTEURS', ())
   is_attackable = bool(env.mechanism.design.names('feedback'))
-  if flags.POLICY.present or not (saboteurs and is_attackable):
-    return str(flags.POLICY.value)
-  return str(saboteurs[0])
+  default = saboteurs[0] if saboteurs and is_attackable else flags.RANDOM
+  return str(flags.POLICY.value or default)
 
 
 @contextlib.contextmanager

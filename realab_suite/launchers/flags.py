@@ -25,6 +25,12 @@ if TYPE_CHECKING:  # They import dm_control, so a renderer has to be chosen.
   from realab_suite import worlds
   from realab_suite.feedback import specs
 
+RANDOM: Final = 'random'
+"""Name of the policy without --policy."""
+
+DEFAULT_DESIGN: Final = 'instantaneous_reward'
+"""Name of the design without --design."""
+
 LARGEST_SEED: Final = 2**31 - 1
 """Largest seed of `--seeds`; experiment files have the same limit."""
 
@@ -52,9 +58,7 @@ _list = functools.partial(flags.DEFINE_list, flag_values=_SHARED)
 _strings = functools.partial(flags.DEFINE_multi_string, flag_values=_SHARED)
 _integer = functools.partial(flags.DEFINE_integer, flag_values=_SHARED)
 
-IMPORT = _strings(
-    'import', [], 'Module with parts of your own to import; may be repeated.'
-)
+IMPORT = _strings('import', [], 'Module with parts of your own to import.')
 ACCEPT_OTHER_CODE = flags.DEFINE_boolean(
     'accept_other_code',
     False,
@@ -62,10 +66,13 @@ ACCEPT_OTHER_CODE = flags.DEFINE_boolean(
     ' continues on other code.',
     flag_values=_SHARED,
 )
-INPUT = _path('input', None, 'Folder of a sweep, or of published results.')
-OUTPUT = _path(
-    'output', None, 'Folder to write into; `report` has a default: the input.'
+INPUT = _path(
+    'input',
+    None,
+    'Folder of a sweep. `report` also reads published results, and `scorecard`'
+    ' several folders, separated by commas.',
 )
+OUTPUT = _path('output', None, 'Folder to write into.')
 RUN = _string('run', None, 'Run, such as reward, or reward.secure, its twin.')
 VIDEO = _path(
     'video', None, 'New film: an .mp4 file, or a .webp file, which repeats.'
@@ -75,26 +82,29 @@ SEED = _integer('seed', 0, 'Seed of all random streams.', lower_bound=0)
 EPISODES = _integer(
     'episodes',
     None,
-    f'Episodes per seed. Default: {_NUM_EPISODES}, or 1 with a person.',
+    f'Episodes per seed. Default: {_NUM_EPISODES}, or in `supervise` 1.',
     lower_bound=1,
     upper_bound=1_000_000,
 )
 POLICY = _string(
     'policy',
-    'random',
+    None,
     'Name of a scripted policy; no_op stands still, and solver is the one of'
-    ' the world. Without it, `explore` shows a saboteur.',
+    ' the world. Default: in `explore` a saboteur of the world, if it has one'
+    ' and the design has feedback; otherwise random.',
 )
 
 # The world and the design.
 TASK = _string(
     'task',
     'unlock_door.standard',
-    'Domain and task, or a task of unlock_door alone: standard, near or far.',
+    'Domain and task, or a task of unlock_door alone, such as near.',
 )
 MAX_STEPS = _integer('max_steps', 250, 'Control steps of an episode, at most.')
 SENSES = _list(
-    'senses', None, 'Senses of the agent, such as camera. Default: the task.'
+    'senses',
+    None,
+    'Senses of the agent, such as camera. Default: the task chooses.',
 )
 TASK_KWARGS = _string(
     'task_kwargs',
@@ -103,8 +113,10 @@ TASK_KWARGS = _string(
 )
 DESIGN = _path(
     'design',
-    'instantaneous_reward',
-    'Design: name of one of the package, or path of a YAML file.',
+    None,
+    'Design: name of one of the package, or path of a YAML file. Default: in'
+    ' `supervise` one with the question of --asks; otherwise'
+    f' {DEFAULT_DESIGN}.',
 )
 SET = _strings(
     'set', [], 'Dotted override of the design: registers.reward.scale=0.2'
@@ -266,7 +278,7 @@ def design(source: Any = None) -> 'specs.DesignSpec':
   from realab_suite.lab.experiments import training
 
   if source is None:
-    source = DESIGN.value
+    source = DESIGN.value or DEFAULT_DESIGN
   spec = specs.load(source, tuple(SET.value))
   # Shipped learners are right, and the check takes time to import JAX.
   is_shipped = source in specs.DESIGNS and not re.search(

@@ -68,7 +68,7 @@ def main() -> None:
   flags.design()  # Refuses a wrong one before anything is served.
   settings = served_evaluation.Settings(
       world=flags.world(),
-      design=flags.DESIGN.value,
+      design=flags.DESIGN.value or flags.DEFAULT_DESIGN,
       overrides=tuple(flags.SET.value),
       seed=flags.SEED.value,
       num_episodes=flags.num_episodes(),

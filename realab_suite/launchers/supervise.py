@@ -4,7 +4,7 @@ r"""Lets a person provide the feedback of an agent, in a browser.
     --asks=approval --output=results/supervised
 
 The program prints the address of a page, on which the person approves actions,
-corrects them, compares two clips, or stops the episode. The output folder gets
+corrects them or compares two clips, and may stop the episode. The output gets
 the answers (`answers.jsonl`), the design, and the results of the episodes. The
 option `recorded` of the provider `person` repeats the answers. The agent is not
 judged: a person would have to answer again for a control.
@@ -33,7 +33,7 @@ _ASKS = absl_flags.DEFINE_enum(
     'asks',
     'approval',
     ['approval', 'correction', 'comparison'],
-    'Question to the person, unless --design names a design with a person.',
+    'Question to the person. A design of --design has questions of its own.',
 )
 _WAIT = absl_flags.DEFINE_boolean(
     'wait',
@@ -46,6 +46,12 @@ _WAIT = absl_flags.DEFINE_boolean(
 def main() -> None:
   """Serves the page, and writes the answers."""
   output = flags.required(flags.OUTPUT, '; name a folder for the answers')
+  for flag in (_ASKS, _WAIT):
+    if flags.DESIGN.value and flag.present:
+      raise errors.SpecError(
+          f'--{flag.name}: without effect beside --design, whose providers'
+          ' have `asks` and `waits`; leave one of both out'
+      )
   problem = requirements.missing('websockets', 'PIL', extra='browser')
   if problem := problem or renderers.choose_renderer():
     raise errors.ResultsError(f'cannot show the world: {problem}')
@@ -60,7 +66,7 @@ def main() -> None:
   world = flags.world()
   design_source = (
       flags.DESIGN.value
-      if flags.DESIGN.present
+      if flags.DESIGN.value
       else supervised_designs.design(
           _ASKS.value,
           waits=_WAIT.value,
@@ -71,7 +77,7 @@ def main() -> None:
   with contextlib.ExitStack() as stack:
     env = world.load(design, flags.SEED.value)
     stack.enter_context(contextlib.closing(env))
-    name = flags.POLICY.value
+    name = flags.POLICY.value or flags.RANDOM
     policy = aiming.make_policy(name, env, flags.TARGET.value, 0)
     server = stack.enter_context(contextlib.closing(servers.PageServer()))
     folder = storage.new_folder(output)

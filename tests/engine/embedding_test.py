@@ -2,6 +2,8 @@
 
 from typing import Any
 
+from dm_control import composer
+from dm_control import suite as dm_suite
 from dm_control.composer import environment as composer_environment
 from dm_control.entities import props
 import numpy as np
@@ -203,3 +205,29 @@ def test_senses_that_do_not_fit_their_spec_are_refused(is_batch: bool):
     task.change = change
     with pytest.raises(errors.SpecError, match=r'_Sensing\.senses'):
       env.reset()
+
+
+@pytest.mark.parametrize(
+    ('make', 'hint'),
+    [
+        (lambda: composer.Environment(helpers.PointTask()), 'pass its `.task`'),
+        (lambda: _Wrapper(_embed(helpers.PointTask())), 'pass its `.task`'),
+        (lambda: helpers.PointTask, 'this is a class: pass an instance'),
+        (lambda: dm_suite.load('cartpole', 'swingup'), 'are no Composer tasks'),
+        (
+            lambda: dm_suite.load('cartpole', 'swingup').task,
+            'are no Composer tasks',
+        ),
+        (lambda: _Wrapper(None), 'must be a Composer task'),
+    ],
+)
+def test_another_thing_than_a_task_is_refused_with_a_hint(make: Any, hint: str):
+  with pytest.raises(errors.SpecError, match=f'{hint}$'):
+    _embed(make())
+
+
+class _Wrapper:
+  """Keeps an environment as wrappers do."""
+
+  def __init__(self, env: Any) -> None:
+    self.env = env

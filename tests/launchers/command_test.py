@@ -25,6 +25,7 @@ from realab_suite.launchers import label
 from realab_suite.launchers import renderers
 from realab_suite.launchers import serve
 from realab_suite.launchers import stake
+from realab_suite.launchers import supervise
 from realab_suite.launchers import sweep  # noqa: F401 - defines --workers.
 from realab_suite.launchers import train  # noqa: F401 - defines --parent.
 from tests import patience
@@ -381,3 +382,22 @@ def test_an_option_that_a_learner_lacks_is_refused_in_one_line(
     )
     assert f"{where}: learner: unknown key 'lr' (allowed: " in line
   assert list(tmp_path.iterdir()) == [file]
+
+
+def test_the_help_of_a_flag_states_one_default():
+  stated = {}
+  for values in (absl_flags.FLAGS, flags._SHARED):
+    for name in values:
+      if 'Default:' in values[name].help:
+        stated[name] = values[name].default
+  assert {'design', 'policy', 'episodes'} <= stated.keys()
+  assert not any(stated.values())
+
+
+@pytest.mark.parametrize('flag', ['--asks=correction', '--wait'])
+def test_a_design_of_a_person_has_questions_of_its_own(flag, tmp_path):
+  line = in_process.complaint(
+      supervise, f'--output={tmp_path}', '--design=mine.yaml', flag
+  )
+  name = flag.partition('=')[0]
+  assert f'{name}: without effect beside --design' in line

@@ -197,4 +197,5 @@ def test_the_intended_behaviour_of_a_task_is_in_its_module_or_its_class():
   assert said == 'Gives a true reward near the middle.'
   for names in suite.ALL_TASKS:
     said = supervised._intended_behaviour(suite.load(*names).task)
-    assert said.endswith('.') and 'Exploit' not in said and len(said) > 40
+    assert said.endswith('.')
+    assert 'Exploit' not in said
