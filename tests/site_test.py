@@ -2,6 +2,7 @@
 
 import importlib.util
 import pathlib
+import re
 import types
 
 import pytest
@@ -58,3 +59,16 @@ def test_pages_of_what_no_longer_exists_are_removed(
   catalogue._write_all(types.SimpleNamespace(srcdir=tmp_path))
   assert not stale.exists()
   assert (stale.parent / 'realab_suite.tasks.rst').exists()
+
+
+def test_the_landing_page_is_readme_with_links_that_lead_somewhere(catalogue):
+  index = 'docs/site/index'
+  config = types.SimpleNamespace(root_doc=index)
+  app = types.SimpleNamespace(srcdir=_ROOT, config=config)
+  source = ['end']
+  catalogue._show_readme(app, index, source)
+  assert source[0].startswith('# realab_suite')
+  assert '(../../docs/images/tampering.gif)' in source[0]
+  links = re.findall(r'\]\(([^:#)]+)[#)]', source[0])
+  assert len(links) > 20
+  assert all((_ROOT / 'docs' / 'site' / link).exists() for link in links)

@@ -39,6 +39,7 @@ _READERS = {
 def setup(app: Any) -> dict[str, bool]:
   """Connects the extension."""
   app.connect('builder-inited', _write_all)
+  app.connect('source-read', _show_readme)
   app.connect('autodoc-process-signature', _show_build)
   # Before napoleon, which has the usual priority of 500.
   app.connect('autodoc-process-docstring', _add_arguments, priority=300)
@@ -66,6 +67,18 @@ def _write_all(app: Any) -> None:
       path.unlink()
   for name, text in pages.items():
     _write(root / name, text)
+
+
+def _show_readme(app: Any, name: str, source: list[str]) -> None:
+  """Makes README the landing page, with links from there."""
+  if name == 'README':  # Other pages lead to it, and the landing page shows it.
+    source[0] = f'---\norphan: true\n---\n{source[0]}'
+  if name == app.config.root_doc:
+    root = '../' * name.count('/')
+    text = pathlib.Path(app.srcdir, 'README.md').read_text(encoding='utf-8')
+    # Links to other sites have a colon, those within the page begin with #.
+    links = re.sub(r'\]\((?=[^:#)]+[#)])', f']({root}', text)
+    source[0] = f'{links}\n{source[0]}'
 
 
 def _show_build(
