@@ -3,6 +3,8 @@
 from collections.abc import Callable, Mapping, Sequence
 import contextlib
 import dataclasses
+import enum
+import functools
 from typing import TYPE_CHECKING, Any, final
 import warnings
 
@@ -39,6 +41,17 @@ warnings.filterwarnings(
 
 MAX_STEPS = 250
 """Length of an episode of the tasks of this suite, in control steps."""
+
+
+@final
+class Omitted(enum.Enum):
+  """Value of the argument `design` if it is omitted: the name of a design."""
+
+  DESIGN = 'instantaneous_reward'
+
+  def __repr__(self) -> str:
+    return f'<{self.value}>'
+
 
 register_task = registry.register_task
 """Decorator that registers a task under a name."""
@@ -194,7 +207,7 @@ def load(
     environment_kwargs: Mapping[str, Any] | None = None,
     visualize_reward: bool = False,
     *,
-    design: specs.Design | None = None,
+    design: specs.Design | Omitted | None = Omitted.DESIGN,
     overrides: Sequence[str] = (),
 ) -> environment.Environment:
   """Loads a task with the feedback of an agent design.
@@ -212,7 +225,9 @@ def load(
     visualize_reward: Must be `False`. Another value would show the true reward
       to the agent.
     design: Name of a design of this package, path of a design file, mapping, or
-      spec; `None` for a world without feedback.
+      spec; `None` or `'none'` for a world without feedback. If it is omitted,
+      it is `'instantaneous_reward'`; a world of another package that this does
+      not fit is then loaded without feedback, with a warning.
     overrides: Dotted overrides of the design, such as `'channel=secure'`.
 
   Raises:
@@ -224,7 +239,9 @@ def load(
         ' true reward to the agent; must be False'
     )
   domain_name, task_name = _names(domain_name, task_name)
-  factory = registry.find(domain_name, task_name)
+  kwargs = _keywords('task_kwargs', task_kwargs)
+  random = kwargs.pop('random', None)
+  task = make_task(domain_name, task_name, kwargs)
   options = {
       'max_steps': MAX_STEPS,
       **_keywords('environment_kwargs', environment_kwargs),
@@ -236,23 +253,47 @@ def load(
         f'{messages.did_you_mean(unknown[0], keys)}; must be max_steps,'
         ' senses or world'
     )
-  kwargs = _keywords('task_kwargs', task_kwargs)
-  random = kwargs.pop('random', None)
+  embedded = functools.partial(
+      embed, task, random=random, overrides=overrides, **options
+  )
+  if not isinstance(design, Omitted):
+    return embedded(design='none' if design is None else design)
   try:
-    task = factory(**kwargs)
+    return embedded(design=design.value)
+  except errors.SpecError as error:
+    if overrides or (domain_name, task_name) in registry.of_package():
+      raise
+    env = embedded(design='none')
+    warnings.warn(
+        f'{domain_name}.{task_name} is loaded without feedback, because no'
+        f' design is given, and {design.value} does not fit: {error}',
+        stacklevel=2,
+    )
+    return env
+
+
+def make_task(
+    domain_name: str, task_name: str | None, kwargs: Mapping[str, Any]
+) -> composer.Task:
+  """Returns a task without feedback, which is not compiled.
+
+  Args:
+    domain_name: Name of the domain.
+    task_name: Name of the variation.
+    kwargs: Keyword arguments of the task, without a seed.
+
+  Raises:
+    SpecError: If a name or an argument is wrong.
+  """
+  factory = registry.find(domain_name, task_name)
+  try:
+    return factory(**kwargs)
   except errors.RealabError:
     raise
   except Exception as error:  # Tasks may raise any class.
     location = messages.Location(f'task_kwargs of {domain_name}.{task_name}')
     problem = _problem_of_arguments(error, factory, kwargs)
     raise location.error(problem) from error
-  return embed(
-      task,
-      'none' if design is None else design,
-      random=random,
-      overrides=overrides,
-      **options,
-  )
 
 
 def _problem_of_arguments(
@@ -282,7 +323,7 @@ def load_batch(
     num_envs: int,
     num_threads: int = 0,
     sleep: bool = False,
-    design: specs.Design | None = None,
+    design: specs.Design | Omitted | None = Omitted.DESIGN,
     overrides: Sequence[str] = (),
 ) -> 'batch_environment.BatchEnvironment':
   """Loads a batch of worlds of a task.
@@ -408,8 +449,9 @@ def embed(
           f'measurements: {messages.quote(name)}: {messages.quote(measure)};'
           ' must be a function of the physics'
       )
+  spec = specs.load(design, overrides).in_world(getattr(task, 'SOLVER', None))
   mechanism = mechanisms.FeedbackMechanism(
-      specs.load(design, overrides).in_world(getattr(task, 'SOLVER', None))
+      spec.fitted(getattr(task, 'measured_ranges', {}))
   )
   mechanism.attach_to(task.root_entity)
   try:

@@ -80,6 +80,25 @@ class World:
         design=design,
     )
 
+  def fitted(
+      self, design: specs.DesignSpec, *others: 'World'
+  ) -> specs.DesignSpec:
+    """Returns a design with the ranges that it has in this world.
+
+    Args:
+      design: The design.
+      *others: Further worlds that it is to fit.
+    """
+    return design.fitted(*(one._measured_ranges for one in (self, *others)))
+
+  @property
+  def _measured_ranges(self) -> Mapping[str, tuple[float, float]]:
+    if self.task_kwargs:
+      task = suite.make_task(self.domain, self.task, self.task_kwargs)
+    else:
+      task = _task(self.domain, self.task)
+    return getattr(task, 'measured_ranges', {})
+
   @property
   def solver(self) -> str | None:
     """Name of the policy that solves the task, or `None`."""
@@ -160,5 +179,5 @@ def _task(domain: str, task: str) -> base.Task:
 def _made(factory: registry.TaskFactory, domain: str, task: str) -> base.Task:
   """Returns a task; `factory` may be registered again, as another class."""
   del factory
-  with contextlib.closing(suite.load(domain, task)) as env:
+  with contextlib.closing(suite.load(domain, task, design=None)) as env:
     return env.task

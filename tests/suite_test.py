@@ -6,6 +6,7 @@
 from collections.abc import Callable
 import contextlib
 import functools
+import inspect
 from typing import Any
 
 from dm_control import composer
@@ -77,7 +78,7 @@ def test_a_seed_decides_everything(case: _Case):
 
 @pytest.mark.parametrize('task', suite.ALL_TASKS[::12])
 def test_no_sense_is_constant(task: tuple[str, str]):
-  env = suite.load(*task, {'random': 5}, {'max_steps': 60})
+  env = suite.load(*task, {'random': 5}, {'max_steps': 60}, design=None)
   seen = [env.reset().observation]
   for action in helpers.random_actions(env, 60):
     seen.append(env.step(action).observation)
@@ -92,7 +93,8 @@ def test_a_random_state_is_read_and_left_as_it_is():
   generator = np.random.RandomState(4)
   before = generator.get_state()[1].copy()
   first, second = (
-      suite.load(*suite.ALL_TASKS[0], {'random': generator}) for _ in range(2)
+      suite.load(*suite.ALL_TASKS[0], {'random': generator}, design=None)
+      for _ in range(2)
   )
   np.testing.assert_array_equal(generator.get_state()[1], before)
   assert first.seed == second.seed
@@ -100,7 +102,7 @@ def test_a_random_state_is_read_and_left_as_it_is():
 
 
 def test_without_a_seed_no_two_worlds_are_alike():
-  envs = [suite.load(*suite.ALL_TASKS[0]) for _ in range(3)]
+  envs = [suite.load(*suite.ALL_TASKS[0], design=None) for _ in range(3)]
   assert len({env.seed for env in envs}) == 3
   assert len({helpers.to_bytes(env.reset()) for env in envs}) == 3
 
@@ -112,6 +114,7 @@ def test_it_loads_as_dm_control_suites_do():
       task_kwargs={'random': 1},
       environment_kwargs={'max_steps': 2},
       visualize_reward=False,
+      design=None,
   )
   assert isinstance(env, composer.Environment)
   assert isinstance(env, dm_env.Environment)
@@ -121,15 +124,52 @@ def test_it_loads_as_dm_control_suites_do():
     env.reset()
 
 
+def _own_room(has_places: bool = True) -> Any:
+  task = collect_apples.CollectApples('near')
+  if not has_places:
+    task.root_entity._places.clear()
+  return task
+
+
+_load_batch = functools.partial(suite.load_batch, num_envs=2)
+
+
+@pytest.mark.parametrize('load', [suite.load, _load_batch])
+def test_a_design_that_is_omitted_is_instantaneous_reward(load, monkeypatch):
+  rewarded, key = specs.load('instantaneous_reward'), 'registers/reward'
+  for world in suite.BENCHMARKING:
+    with contextlib.closing(load(*world)) as env:
+      assert env.mechanism.design.name == rewarded.name
+      assert key in env.observation_spec()
+  assert 'design: ' in str(text := inspect.signature(load))
+  assert '= <instantaneous_reward>' in str(text)
+  for design in (None, 'none'):
+    with contextlib.closing(load('unlock_door.near', design=design)) as env:
+      assert not env.mechanism.registers
+  monkeypatch.setitem(registry._TASKS, ('own', 'room'), (_own_room, ()))
+  with contextlib.closing(load('own', 'room')) as env:
+    assert env.mechanism.design == rewarded
+  bare = ('own', 'room', {'has_places': False})
+  with pytest.warns(UserWarning, match=r'without.*no place') as warned:
+    env = load(*bare)
+  assert len(warned) == 1
+  assert not env.mechanism.registers
+  for asked in ({'design': rewarded.name}, {'overrides': ['dof=planar']}):
+    with pytest.raises(errors.SpecError, match=r'no place'):
+      load(*bare, **asked)
+
+
 def test_an_episode_lasts_250_steps_unless_it_has_no_limit():
-  env = suite.load('collect_apples', 'boxed', {'random': 1})
+  env = suite.load('collect_apples', 'boxed', {'random': 1}, design=None)
   assert env.max_steps == suite.MAX_STEPS == 250
   env.reset()
   steps = [env.step(helpers.no_op(env)) for _ in range(suite.MAX_STEPS)]
   assert [step.last() for step in steps] == [False] * 249 + [True]
   left = [float(step.observation['senses/time_left']) for step in steps]
   np.testing.assert_allclose(left, 1 - np.arange(1, 251) / 250, atol=1e-6)
-  env = suite.load('collect_apples', 'boxed', None, {'max_steps': None})
+  env = suite.load(
+      'collect_apples', 'boxed', None, {'max_steps': None}, design=None
+  )
   assert env.reset().observation.keys() == env.observation_spec().keys()
   assert 'senses/time_left' not in env.observation_spec()
 
@@ -172,10 +212,7 @@ def test_a_registered_task_is_loadable_by_name():
   finally:
     del registry._TASKS[name]
   with pytest.raises(errors.UnknownNameError):
-    suite.load(*name)
-
-
-_load_batch = functools.partial(suite.load_batch, num_envs=2)
+    suite.load(*name, design=None)
 
 
 @pytest.mark.parametrize('load', [suite.load, _load_batch])

@@ -146,7 +146,7 @@ def _table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 
 
 def _world(domain: str, task: str) -> str:
-  env = suite.load(domain, task, {'random': 0})
+  env = suite.load(domain, task, {'random': 0}, design=None)
   with contextlib.closing(env):
     kind = type(env.task)
     layout = env.task.layout

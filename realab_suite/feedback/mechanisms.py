@@ -25,6 +25,7 @@ from realab_suite.entities.registers import base
 from realab_suite.entities.registers import ports
 from realab_suite.feedback import assembly
 from realab_suite.feedback import composer_hooks
+from realab_suite.feedback import fitting
 from realab_suite.feedback import measurements
 from realab_suite.feedback import phases
 from realab_suite.feedback import provider_entities
@@ -368,9 +369,8 @@ class FeedbackMechanism(modelled.ModelledEntity):
     """
     if needed is None:
       return
-    low, high = self._design.registers[register].range
-    # Sums of 0.1 may differ from what anybody would write.
-    if low <= round(needed[0], 9) and round(needed[1], 9) <= high:
+    low, high = available = self._design.registers[register].range
+    if fitting.holds(available, needed):
       return
     raise errors.SpecError(
         f'design {self._design.name!r}: registers.{register}.range:'

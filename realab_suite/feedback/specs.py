@@ -15,6 +15,7 @@ from realab_suite.entities import registers
 from realab_suite.entities.registers import arguments
 from realab_suite.entities.registers import ports
 from realab_suite.feedback import consistency
+from realab_suite.feedback import fitting
 from realab_suite.feedback import measurements
 from realab_suite.feedback import objectives
 from realab_suite.feedback import providers
@@ -30,6 +31,9 @@ Coordinate = Annotated[float, pydantic.Field(ge=-1e4, le=1e4)]
 # a second and take 10 ms for a control step; both times are linear in the
 # number. MuJoCo reserves 160 MB for their contacts, quadratic in the number.
 MAX_REGISTERS = 100
+
+# Key of a range that gives way to what a world declares.
+_USUAL = 'usual'
 
 READ_BY_AGENTS = consistency.READ_BY_AGENTS
 WRITTEN_BY_PROVIDERS = consistency.WRITTEN_BY_PROVIDERS
@@ -75,6 +79,9 @@ class RegisterSpec(arguments.Arguments):
   A secure design overrides the channel. Without degrees of freedom, a
   register has those of the design.
 
+  A range `{usual: [low, high]}` is not stated: it gives way to what a world
+  declares; see `DesignSpec.fitted`.
+
   Attributes:
     kind: Name of a registered register kind.
     role: See `Arguments`.
@@ -102,6 +109,25 @@ class RegisterSpec(arguments.Arguments):
           reserved=registers.Register._build,
       ),
   ] = pydantic.Field(default_factory=dict)
+
+  @pydantic.model_validator(mode='wrap')
+  @classmethod
+  def _usual_range(cls, data: Any, handler: Any) -> 'RegisterSpec':
+    """Accepts `{usual: [low, high]}` for a range that is not stated."""
+    given = data.get('range') if isinstance(data, Mapping) else None
+    if not isinstance(given, Mapping) or _USUAL not in given:
+      made: RegisterSpec = handler(data)
+      return made
+    ends: Any = given[_USUAL]
+    # An override of one end states both.
+    if loading.is_list(ends) and given.keys() <= {_USUAL, '0', '1'}:
+      ends = [given.get(str(i), end) for i, end in enumerate(ends)]
+    else:
+      ends = given
+    made = handler({**data, 'range': ends})
+    if len(given) == 1:
+      made.model_fields_set.discard('range')
+    return made
 
   @pydantic.field_validator('place', mode='before')
   @classmethod
@@ -387,15 +413,40 @@ class DesignSpec(validation.Spec):
         DesignSpec, {**self.to_source(), 'providers': adapted}, where
     )
 
-  def to_source(self) -> dict[str, Any]:
-    """Returns the design without the `initial` that registers do not state.
+  def fitted(self, *worlds: Mapping[str, measurements.Range]) -> 'DesignSpec':
+    """Returns the design with the ranges that it needs in worlds.
 
-    A stated value may be kept by a register that no provider writes.
+    Ranges that are stated stay, as do those that contain what the worlds
+    declare; see `fitting`. The others stay open to further worlds.
+
+    Args:
+      *worlds: Ranges of what each world measures, by name.
+
+    Raises:
+      SpecError: If no range that the design may have is large enough.
+    """
+    changes = fitting.changes(self, worlds)
+    if not changes:
+      return self
+    data = self.to_source()
+    for name, (ends, scale) in changes.items():
+      data['registers'][name] |= {'range': {_USUAL: [*ends]}, 'scale': scale}
+    where = f'design {self.name!r}, with the ranges that this world needs'
+    return validation.validate(DesignSpec, data, where)
+
+  def to_source(self) -> dict[str, Any]:
+    """Returns the design with what its registers do not state left open.
+
+    They lack an `initial` that they do not state. A stated value may be kept by
+    a register that no provider writes.
     """
     data = self.to_mapping()
     for name, spec in self.registers.items():
+      source = data['registers'][name]
       if 'initial' not in spec.model_fields_set:
-        del data['registers'][name]['initial']
+        del source['initial']
+      if 'range' not in spec.model_fields_set:
+        source['range'] = {_USUAL: source['range']}
     return data
 
   def channel_of(self, name: str) -> arguments.Channel:

@@ -266,7 +266,7 @@ def world() -> 'worlds.World':
 
 
 def design(source: Any = None) -> 'specs.DesignSpec':
-  """Returns the design that the flags describe, with its overrides.
+  """Returns the design that the flags describe, as it is in their world.
 
   Args:
     source: Source of the design instead of --design.
@@ -286,7 +286,7 @@ def design(source: Any = None) -> 'specs.DesignSpec':
   )
   if spec.learner is not None and not is_shipped:
     training.check_learner(spec, str(source), is_trained=False)
-  return spec
+  return world().fitted(spec)
 
 
 def find_run(runs: Mapping[str, _Run]) -> _Run:

@@ -59,7 +59,9 @@ def check_provider(
       isinstance(provider, base.Provider),
       f'{provider!r:.80}: must be a provider, an instance of its class',
   )
-  with contextlib.closing(suite.load(domain_name, task_name)) as env:
+  with contextlib.closing(
+      suite.load(domain_name, task_name, design=None)
+  ) as env:
     provider = provider.in_world(env.task.SOLVER)
   worlds = [
       _inputs(provider, ranges or {}, world, (domain_name, task_name))
@@ -88,6 +90,7 @@ def _inputs(
           # The agent needs at least one sense.
           'senses': sorted({*provider.required_senses, 'time_left'}),
       },
+      design=None,
   )
   generator = np.random.default_rng(world)
   spec = env.action_spec()

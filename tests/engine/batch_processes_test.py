@@ -84,7 +84,7 @@ def test_a_batch_without_threads_goes_on_in_a_forked_process():
 
 @pytest.fixture(name='batch', scope='module')
 def _batch():
-  return suite.load_batch('unlock_door', 'near', num_envs=2)
+  return suite.load_batch('unlock_door', 'near', num_envs=2, design=None)
 
 
 @pytest.mark.parametrize('copying', [copy.copy, copy.deepcopy, pickle.dumps])
@@ -101,7 +101,7 @@ def test_a_batch_has_a_thread_for_each_processor_that_it_may_use():
   os.sched_setaffinity(0, {min(allowed)})
   try:
     assert arguments.processors() == 1
-    batch = suite.load_batch('unlock_door', 'near', num_envs=4)
+    batch = suite.load_batch('unlock_door', 'near', num_envs=4, design=None)
     assert batch.physics._batch.nthread == 1
     assert batch.physics._poses.nthread == 1
   finally:

@@ -64,7 +64,9 @@ raise SystemExit(9 if frames[0].any() else 1)
 
 
 def _load(size=(64, 64), seed=0, name='unlock_door'):
-  return suite.load(name, 'standard', {'random': seed, 'camera_size': size})
+  return suite.load(
+      name, 'standard', {'random': seed, 'camera_size': size}, design=None
+  )
 
 
 def _frame(time_step):

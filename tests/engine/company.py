@@ -61,8 +61,10 @@ def _open_dm_control() -> Renderer:
 
 
 OURS = {
-    'single': lambda: _see(suite.load(*_NEAR, {'random': 0})),
-    'batch': lambda: _see(suite.load_batch(*_NEAR, {'random': 0}, num_envs=2)),
+    'single': lambda: _see(suite.load(*_NEAR, {'random': 0}, design=None)),
+    'batch': lambda: _see(
+        suite.load_batch(*_NEAR, {'random': 0}, num_envs=2, design=None)
+    ),
     'door': lambda: _render(registration.make(*_NEAR, 'none', **_RGB)),
 }
 OTHERS = {

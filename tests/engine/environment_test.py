@@ -48,7 +48,7 @@ def test_the_last_step_is_where_the_time_is_up():
 
 
 def test_taking_the_large_apple_ends_the_episode_with_discount_0():
-  env = suite.load('unlock_door', 'standard', {'random': 1})
+  env = suite.load('unlock_door', 'standard', {'random': 1}, design=None)
   sink = helpers.RecordingSink()
   env.add_sink(sink)
   env.reset()

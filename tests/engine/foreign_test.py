@@ -114,8 +114,12 @@ def test_a_batch_is_refused_with_the_remedy():
     with pytest.raises(
         errors.SpecError, match=r'keeps state in Python.*with world=i instead'
     ):
-      suite.load_batch(*name, num_envs=2)
-    assert suite.load(*name, {'random': 1}, {'world': 1}).reset().first()
+      suite.load_batch(*name, num_envs=2, design=None)
+    assert (
+        suite.load(*name, {'random': 1}, {'world': 1}, design=None)
+        .reset()
+        .first()
+    )
   finally:
     del registry._TASKS[name]
 

@@ -90,7 +90,7 @@ def test_selected_senses_equal_those_of_an_agent_with_all_of_them(
 def test_wrong_senses_are_refused_in_one_line(senses, complaint):
   with pytest.raises(errors.SpecError) as raised:
     # Without a register that the agent reads, it would observe nothing.
-    suite.load('unlock_door', 'near', None, {'senses': senses})
+    suite.load('unlock_door', 'near', None, {'senses': senses}, design=None)
   [line] = str(raised.value).splitlines()
   assert line.startswith('senses: ')
   assert complaint in line

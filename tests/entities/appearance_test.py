@@ -71,7 +71,7 @@ def test_a_class_of_a_default_is_listed():
 
 @pytest.mark.parametrize('domain', suite.TASKS_BY_DOMAIN)
 def test_the_specs_of_all_worlds_have_the_same_classes(domain: str):
-  env = suite.load(domain, suite.TASKS_BY_DOMAIN[domain][0])
+  env = suite.load(domain, suite.TASKS_BY_DOMAIN[domain][0], design=None)
   spec = env.observation_spec()[_RAYS]
   assert (spec.minimum, spec.maximum) == (0, appearance.CAPACITY - 1)
   # Those that each world lists, and then its own.

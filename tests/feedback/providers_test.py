@@ -56,7 +56,9 @@ def _inputs() -> Iterator[None]:
     patch.setattr(
         suite,
         'load',
-        lambda *names: kept.load(names, functools.partial(load, *names)),
+        lambda *names, design: kept.load(
+            names, functools.partial(load, *names, design=design)
+        ),
     )
     yield
 

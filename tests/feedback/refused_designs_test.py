@@ -166,7 +166,7 @@ _DETECTS = 'meters.0.measures={kind: detector, of: [reward]}'
         (
             'off_switch.standard',
             'instantaneous_reward',
-            [],
+            ['registers.score.range=[0, 20]'],
             'score.range: [0, 20]; must contain [-11, 10], the range of'
             " 'score' (meters.0) in this world; give it a smaller"
             ' registers.score.scale if it then lacks room',
@@ -174,13 +174,13 @@ _DETECTS = 'meters.0.measures={kind: detector, of: [reward]}'
         (
             'good_objects.member_1',
             'inspected_reward',
-            [],
+            ['registers.meter.range.1=20'],
             'meter.range: [0, 20]; must contain [-6, 6]',
         ),
         (
             'assistant.held_out',
             'instantaneous_reward',
-            ['meters.0.measures={kind: score}'],
+            ['meters.0.measures={kind: score}', 'registers.score.range.0=0'],
             'score.range: [0, 20]; must contain [-1.2, 2.4]',
         ),
         (

@@ -185,7 +185,7 @@ def test_plans_include_the_actions_of_a_solver_that_they_lack():
   )
   assert policy.action_set.actions[:-1] == own.actions
   assert policy.action_set.actions[-1] == ('drive.spin', _ACTIONS[1][1])
-  env = suite.load('unlock_door', 'near', {'random': 1})
+  env = suite.load('unlock_door', 'near', {'random': 1}, design=None)
   action = actors.make(policy, env).act(env.reset())
   assert _controls(env, action) == _ACTIONS[1][1]
 

@@ -24,12 +24,13 @@ from tests.engine import helpers
         ('unlock_door.standard', ['pad', 'apples', 'large_apple'], 18.0),
     ],
 )
-def test_taking_everything_reaches_the_end_of_a_range_and_stays_in(
+def test_taking_everything_reaches_the_end_of_a_range_and_is_representable(
     world: str, kinds: list[str], reached: float
 ):
   scores = []
   for seed in range(1, 5):
     env = suite.load(world, task_kwargs={'random': seed})
+    paid = 0.0
     with contextlib.closing(env):
       env.reset()
       parts: list[measurables.Measurable] = [
@@ -45,9 +46,12 @@ def test_taking_everything_reaches_the_end_of_a_range_and_stays_in(
         for name, (low, high) in env.task.measured_ranges.items():
           value = env.task.measurements[name](env.physics)
           assert low - 1e-9 <= value <= high + 1e-9, name
+        paid += env.mechanism.ports['reward'].applied(env.physics)
         scores.append(float(env.task.score(env.physics)))
         if time_step.last():
           break
+      measured = env.mechanism.ports['score'].applied(env.physics)
+    assert paid == pytest.approx(measured, abs=1e-6)
   end = env.task.measured_ranges['score'][reached > 0]
   extreme = max(scores) if reached > 0 else min(scores)
   assert [end, extreme] == pytest.approx([reached, reached], abs=1e-3)

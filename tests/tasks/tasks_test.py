@@ -24,7 +24,7 @@ _NUM_APPLES = {'collect_apples': 10, 'unlock_door': 8}
 def _load(
     domain: str, variation: str = 'standard', seed: int = 3
 ) -> tuple[environment.Environment, helpers.RecordingSink]:
-  env = suite.load(domain, variation, {'random': seed})
+  env = suite.load(domain, variation, {'random': seed}, design=None)
   sink = helpers.RecordingSink()
   env.add_sink(sink)
   env.reset()

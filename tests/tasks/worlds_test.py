@@ -180,12 +180,12 @@ def test_agents_sense_nothing_of_what_the_solver_knows(domain: str):
   for name in env.task.privileged_senses:
     assert not any(name in key.split('/') for key in env.observation_spec())
     with pytest.raises(errors.SpecError, match='senses: unknown'):
-      suite.load(domain, _task(domain), {}, {'senses': [name]})
+      suite.load(domain, _task(domain), {}, {'senses': [name]}, design=None)
   env.close()
 
 
 def test_a_solver_of_another_world_is_refused():
-  env = suite.load('collect_apples', 'near')
+  env = suite.load('collect_apples', 'near', design=None)
   solver = realab.make_policy('tidy_up_solver')
   with pytest.raises(errors.SpecError, match='this task offers'):
     realab.evaluate(env, solver, 1)

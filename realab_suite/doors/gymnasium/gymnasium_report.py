@@ -206,7 +206,7 @@ def _judged_design(
     return design
   objective = {'kind': objectives.RETURN, 'registers': {register: 1.0}}
   learner = {'kind': 'gymnasium', 'objective': objective}
-  return specs.load({**design.to_mapping(), 'learner': learner})
+  return specs.load({**design.to_source(), 'learner': learner})
 
 
 def _num_seeds(

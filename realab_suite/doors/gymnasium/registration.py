@@ -20,7 +20,7 @@ NAMESPACE = 'realab'
 def make(
     domain_name: str,
     task_name: str | None = None,
-    design: specs.Design | None = None,
+    design: specs.Design | suite.Omitted | None = suite.Omitted.DESIGN,
     **options: Any,
 ) -> Any:
   """Loads a world: the entry point of the registered ids.
@@ -28,7 +28,7 @@ def make(
   Args:
     domain_name: Same as in `suite.load`.
     task_name: Same as in `suite.load`.
-    design: Design, by name, path or contents.
+    design: Same as in `suite.load`.
     **options: Other arguments of `suite.load`, and values of
       `interfaces.Options`.
 
@@ -45,7 +45,7 @@ def make(
 def make_vector(
     domain_name: str,
     task_name: str | None = None,
-    design: specs.Design | None = None,
+    design: specs.Design | suite.Omitted | None = suite.Omitted.DESIGN,
     *,
     num_envs: int,
     **options: Any,
@@ -55,7 +55,7 @@ def make_vector(
   Args:
     domain_name: Same as in `suite.load`.
     task_name: Same as in `suite.load`.
-    design: Design, by name, path or contents.
+    design: Same as in `suite.load`.
     num_envs: Number of worlds.
     **options: Other arguments of `suite.load_batch`, `autoreset_mode`, and
       values of `interfaces.Options`.

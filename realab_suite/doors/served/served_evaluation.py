@@ -85,7 +85,7 @@ def serve(settings: Settings, say: Callable[[str], None]) -> None:
   logging.warning(_WARNING, results.SERVED)
   world = settings.world
   with contextlib.ExitStack() as stack:
-    design = specs.load(settings.design, settings.overrides)
+    design = world.fitted(specs.load(settings.design, settings.overrides))
     env = world.load(design, settings.seed)
     stack.callback(env.close)
     env.mechanism.phases.guard_providers(lambda: deadline(_PROVIDER_SECONDS))

@@ -18,6 +18,7 @@ Observation = Mapping[str, np.ndarray]
 Readings = Mapping[str, np.ndarray]
 # A value to write, or a value and a mask.
 Writes = Mapping[str, np.ndarray | tuple[np.ndarray, np.ndarray]]
+Range = tuple[float, float]
 # Files contain lists, but strict validation accepts only tuples.
 Names = Annotated[tuple[str, ...], pydantic.Field(strict=False)]
 OneName = Annotated[
@@ -175,6 +176,17 @@ class Provider(validation.Model):
     """
     del batch_shape
     return ()
+
+  def write_ranges(self, ranges: Mapping[str, Range]) -> Mapping[str, Range]:
+    """Returns the ranges of what the provider writes, by name, where known.
+
+    Override this in a subclass whose writes are in the units of its reads.
+
+    Args:
+      ranges: Lowest and highest value of each register, by name.
+    """
+    del ranges
+    return {}
 
   @abc.abstractmethod
   def step(

@@ -1,5 +1,6 @@
 """Instantaneous reward: the difference of two scores (paper, section 3.4)."""
 
+from collections.abc import Mapping
 from typing import Any, Literal, final
 
 import numpy as np
@@ -24,6 +25,13 @@ class Difference(base.Provider):
   reads: base.OneName
   writes: base.OneName
   initial: float = 0.0
+
+  def write_ranges(
+      self, ranges: Mapping[str, base.Range]
+  ) -> dict[str, base.Range]:
+    ends = *ranges[self.reads[0]], self.initial
+    span = max(ends) - min(ends)
+    return {self.writes[0]: (-span, span)}
 
   def initial_state(self, batch_shape: tuple[int, ...]) -> np.ndarray:
     return np.full(batch_shape, self.initial)

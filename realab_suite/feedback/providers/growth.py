@@ -1,5 +1,6 @@
 """Growth: the increase of a weighted sum of readings."""
 
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal, final
 
 import numpy as np
@@ -46,6 +47,15 @@ class Growth(WeightedSum):
   """
 
   kind: Literal['growth'] = 'growth'
+
+  def write_ranges(
+      self, ranges: Mapping[str, base.Range]
+  ) -> dict[str, base.Range]:
+    # The sum begins with 0.
+    ends = np.array([(0.0, *ranges[name]) for name in self.reads])
+    weights = np.abs(self.weights or np.ones(len(ends)))
+    span = float(np.ptp(ends, axis=1) @ weights)
+    return {self.writes[0]: (-span, span)}
 
   def initial_state(self, batch_shape: tuple[int, ...]) -> np.ndarray:
     return np.zeros(batch_shape)

@@ -181,6 +181,15 @@ class Inspection(base.Provider):
     if self.pays is not None:
       self.pays.check(design)
 
+  def write_ranges(
+      self, ranges: Mapping[str, base.Range]
+  ) -> dict[str, base.Range]:
+    paid = dict(self.pays.write_ranges(ranges)) if self.pays else {}
+    if (name := self.writes[0]) in paid:
+      low, high = paid[name]
+      paid[name] = low - self.penalty, high
+    return paid
+
   def _check_alarm(self, design: Any) -> None:
     """Checks that a learner that heeds an alarm can notice one.
 

@@ -1,5 +1,6 @@
 """Relayed values, such as a command of the operator."""
 
+from collections.abc import Mapping
 from typing import Any, Literal, final
 
 import numpy as np
@@ -15,6 +16,11 @@ class Relay(base.Provider):
   kind: Literal['relay'] = 'relay'
   reads: base.OneName
   writes: base.OneName
+
+  def write_ranges(
+      self, ranges: Mapping[str, base.Range]
+  ) -> dict[str, base.Range]:
+    return {self.writes[0]: ranges[self.reads[0]]}
 
   def step(
       self,

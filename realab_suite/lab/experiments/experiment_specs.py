@@ -256,6 +256,7 @@ class ExperimentSpec(validation.Spec):
     for name, run in self.runs.items():
       try:
         design = run.load(is_confined=validation.are_paths_confined(info))
+        design = self.of_run(run)._fitted(design)
         # What learns in a world is no part of it.
         world = run.task, design.model_copy(update={'learner': None})
         if world not in checked:
@@ -286,6 +287,11 @@ class ExperimentSpec(validation.Spec):
             f' lacks the tag {registry.HELD_OUT!r}, which is for judging'
         )
     return self
+
+  def _fitted(self, design: specs.DesignSpec) -> specs.DesignSpec:
+    """Returns a design with ranges for the tasks that it is used in."""
+    others = [self.at(task).world for task in self.training.tasks]
+    return self.world.fitted(design, *others)
 
   def _check_world(self, design: specs.DesignSpec) -> None:
     """Checks that the world of a run can be loaded, and its policies can act.

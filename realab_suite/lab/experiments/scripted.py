@@ -151,7 +151,9 @@ def plan(settings: Settings) -> list[Run]:
       (f'channel={channel}',) for channel in settings.channels
   ]
   designs = [
-      specs.load(settings.design, (*settings.overrides, *channel))
+      settings.world.fitted(
+          specs.load(settings.design, (*settings.overrides, *channel))
+      )
       for channel in channels or [()]
   ]
   return [

@@ -53,6 +53,14 @@ def test_every_shipped_world_has_an_id_with_every_design():
   assert len(ids) == len(set(ids)) == number > 100
   assert set(ids) <= set(gym.registry)
   assert _NEAR in ids
+  for make, many in (
+      (registration.make, {}), (registration.make_vector, {'num_envs': 2})
+  ):  # fmt: skip
+    seen = [
+        make('off_switch', 'far', **many, **chosen).observation_space.spaces
+        for chosen in ({}, {'design': 'instantaneous_reward'}, {'design': None})
+    ]
+    assert seen[0] == seen[1] != seen[2]
 
 
 def test_worlds_are_not_copied_because_copies_expose_the_environment():
@@ -362,7 +370,7 @@ def test_frames_without_room_are_refused_when_a_world_is_made(height, width):
 
 @pytest.mark.parametrize('size', [(0, 9), (9, -1), (1.5, 9), (9, 641)])
 def test_frames_that_are_no_frames_are_refused(size):
-  batch = suite.load_batch('unlock_door', 'near', num_envs=1)
+  batch = suite.load_batch('unlock_door', 'near', num_envs=1, design=None)
   with pytest.raises(errors.SpecError, match=r'(height|width): .*buffer'):
     batch.render(None, 'top_down', *size)
 

@@ -78,7 +78,9 @@ def _kinds(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Kind]:
            'names': ['a', 'b'], 'pair': (1, 2.5)}  # fmt: skip
   checkpoint = folder / storage.CHECKPOINT
   storage.write_archive(checkpoint, header, state)
-  with suite.load('collect_apples', 'standard', {'random': 0}) as env:
+  with suite.load(
+      'collect_apples', 'standard', {'random': 0}, design=None
+  ) as env:
     env.reset()
     world, world_header = env.save().to_bytes(), env.snapshot_header()
   snapshot, network = folder / 'world.snapshot', folder / 'net.npz'
