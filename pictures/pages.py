@@ -75,11 +75,12 @@ def worlds() -> str:
   """Returns the sections of the worlds of this package."""
   parts = [
       '**Accurate feedback.** A design is refused in a world where a meter may'
-      ' measure more than its register holds. Elsewhere, the solver and random'
-      ' actions have played its secure twin, and clean values were beyond the'
-      f' range of a register in at most {100 * stakes.MOST_SATURATED:g} % of'
-      ' episodes (`python -m benchmarks.suite_table --accuracy`). Worlds that'
-      ' are not named lack what is measured.',
+      ' measure more than the stated range of its register. Elsewhere, the'
+      ' solver and random actions have played its secure twin, and clean values'
+      ' were beyond the range of a register in at most'
+      f' {100 * stakes.MOST_SATURATED:g} % of episodes (`python -m'
+      ' benchmarks.suite_table --accuracy`). Worlds that are not named lack'
+      ' what is measured.',
       accuracy_table(),
       *map(_domain, suite.TASKS_BY_DOMAIN),
   ]
@@ -107,7 +108,7 @@ def accuracy_table() -> str:
     cells = 'all' if is_everywhere else _listed(accurate), refused or '-'
     rows.setdefault(cells, []).append(design)
   return table(
-      ('designs', ACCURATE, 'refused'),
+      ('designs', ACCURATE, 'refused, or not accurate'),
       [(_listed(designs), *cells) for cells, designs in rows.items()],
   )
 
@@ -126,9 +127,11 @@ def accuracies(domain: str) -> dict[str, dict[str, list[str]]]:
         at_load[key] = _at_load(world, design)
       text = at_load[key]
       if text == ACCURATE:
-        measured = row.get(f'saturated, {design}', '1 of 1')
+        measured = row.get(f'saturated, {design}', '0 of 0')
         saturated, episodes = map(int, measured.split(' of '))
-        if saturated > stakes.MOST_SATURATED * episodes:
+        if not episodes:
+          text = 'not yet played'
+        elif saturated > stakes.MOST_SATURATED * episodes:
           text = f'saturated in {measured} episodes'
       by_text.setdefault(text, []).append(task)
   return said
@@ -137,6 +140,7 @@ def accuracies(domain: str) -> dict[str, dict[str, list[str]]]:
 def _at_load(world: base.Task, design: str) -> str:
   """Returns whether a world refuses a design."""
   spec = specs.load(design).in_world(world.SOLVER)
+  spec = spec.fitted(world.measured_ranges)
   mechanism = mechanisms.FeedbackMechanism(spec)
   mechanism.attach_to(world.root_entity)
   try:

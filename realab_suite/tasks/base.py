@@ -144,9 +144,10 @@ class Task(composer.Task):
   def measured_ranges(self) -> Mapping[str, tuple[float, float]]:
     """Lowest and highest value of measurements, by name.
 
-    No policy leaves these ranges, in any state of an episode. A design whose
-    meter writes to a register with a narrower range is refused; measurements
-    without a range are not checked.
+    No policy leaves these ranges, in any state of an episode. A design that
+    states a narrower range for the register of a meter is refused, and ranges
+    that it leaves open are resolved to these; measurements without a range are
+    not checked.
     """
     return {}
 
