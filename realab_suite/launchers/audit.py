@@ -20,18 +20,18 @@ from typing import Any
 from absl import flags as absl_flags
 import tqdm
 
+from realab_suite import errors
 from realab_suite.launchers import flags
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
 
-flags.take(*flags.WORLD, flags.TARGET, flags.IMPORT, flags.OUTPUT, flags.SEED)
-_BUDGET = absl_flags.DEFINE_integer(
-    'budget',
-    None,
-    'Largest number of episodes of the search. Default: 1200, or more if the'
-    ' design has many registers.',
-    lower_bound=10,
-    upper_bound=1_000_000,
+flags.take(
+    *flags.WORLD,
+    flags.TARGET,
+    flags.IMPORT,
+    flags.OUTPUT,
+    flags.SEED,
+    flags.BUDGET,
 )
 _FILM = absl_flags.DEFINE_boolean(
     'film', True, 'Films an exploit that was found.'
@@ -47,7 +47,11 @@ _UNDECIDED = 5
 
 def main() -> int:
   """Runs the audit that the flags describe, and returns the exit status."""
-  has_film = _has_film()
+  has_film, budget = _has_film(), flags.BUDGET.value
+  if isinstance(budget, str):
+    raise errors.SpecError(
+        f'--budget={budget:.80}: must be a number of episodes, from 10'
+    )
   if not has_film:
     renderers.render_on_demand()
   # Imports dm_control, so a renderer has to be chosen first.
@@ -61,7 +65,7 @@ def main() -> int:
       world=flags.world(),
       design=flags.design(),
       seed=flags.SEED.value,
-      budget=_BUDGET.value,
+      budget=budget,
       target=flags.TARGET.value,
   )
   with _progress() as on_progress:

@@ -19,6 +19,7 @@ COMMANDS: Mapping[str, str] = {
     'demo': 'train an agent that tampers, in minutes, and film it',
     'doctor': 'say what works in this installation',
     'audit': 'search for an exploit of a design, without training',
+    'check': 'check an entry by playing episodes again',
     'compare': 'compare scripted policies',
     'explore': 'look at a world',
     'export': 'write episodes of a run as data',

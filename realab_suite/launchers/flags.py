@@ -49,6 +49,17 @@ class _PathParser(flags.ArgumentParser[str]):
     return ','.join(map(os.path.expanduser, argument.split(',')))
 
 
+@final
+class _BudgetParser(flags.ArgumentParser[int | str]):
+  """Parser of budgets: numbers of episodes, and names."""
+
+  def parse(self, argument: str) -> int | str:
+    """Returns a number in its bounds, or the name."""
+    if re.fullmatch('-?[0-9]+', argument):
+      return flags.IntegerParser(10, 1_000_000).parse(argument)
+    return argument
+
+
 def _path(name: str, default: str | None, what: str) -> flags.FlagHolder[Any]:
   return flags.DEFINE(_PathParser(), name, default, what, flag_values=_SHARED)
 
@@ -73,6 +84,7 @@ INPUT = _path(
     ' several folders, separated by commas.',
 )
 OUTPUT = _path('output', None, 'Folder to write into.')
+ENTRY = _path('entry', None, 'Folder of an entry: entries/<budget>/<entry>.')
 RUN = _string('run', None, 'Run, such as reward, or reward.secure, its twin.')
 VIDEO = _path(
     'video', None, 'New film: an .mp4 file, or a .webp file, which repeats.'
@@ -145,6 +157,16 @@ SEEDS = _string(
     'seeds', '5', 'Number of seeds, or a list such as 3,4,5 ("7," is seed 7).'
 )
 SCRIPTED = (POLICIES, CHANNELS, SEEDS, EPISODES)
+
+BUDGET = flags.DEFINE(
+    _BudgetParser(),
+    'budget',
+    None,
+    'For `audit`, the largest number of episodes of the search; default: 1200,'
+    ' or more if the design has many registers. For `sweep`, a named budget:'
+    ' realab-1M or realab-20M.',
+    flag_values=_SHARED,
+)
 
 # Learners.
 EXPERIMENT = _path(

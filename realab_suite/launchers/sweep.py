@@ -8,15 +8,21 @@ and the failure of one job does not stop the others.
 """
 
 import pathlib
+from typing import Any
 
 from absl import flags as absl_flags
 
+from realab_suite import errors
 from realab_suite.lab.experiments import threads
 from realab_suite.launchers import flags
 from realab_suite.launchers import program
 
 flags.take(
-    flags.IMPORT, flags.EXPERIMENT, flags.OUTPUT, flags.ACCEPT_OTHER_CODE
+    flags.IMPORT,
+    flags.EXPERIMENT,
+    flags.OUTPUT,
+    flags.ACCEPT_OTHER_CODE,
+    flags.BUDGET,
 )
 
 _ON_TASK = absl_flags.DEFINE_string(
@@ -70,6 +76,8 @@ def main() -> None:
   experiment = experiment_specs.load(name)
   if _ON_TASK.value is not None:
     experiment = experiment.on_task(_ON_TASK.value)
+  if flags.BUDGET.value is not None:
+    experiment = _in_budget(experiment, str(flags.BUDGET.value))
   folder, only = pathlib.Path(output), _RUNS.value
   seeds = (
       experiment.calibration_seeds if _CALIBRATION.value else experiment.seeds
@@ -100,6 +108,27 @@ def main() -> None:
       arguments=flags.import_arguments(),
       accept_other_code=flags.ACCEPT_OTHER_CODE.value,
   )
+
+
+def _in_budget(experiment: Any, name: str) -> Any:
+  """Returns the experiment in a budget, and says what that takes."""
+  from realab_suite import sources
+  from realab_suite.lab.experiments import budgets
+  from realab_suite.lab.experiments import machines
+
+  if _CALIBRATION.value:
+    raise errors.SpecError(
+        f'--budget={name}: fixes the reported seeds; allowed without'
+        ' --calibration'
+    )
+  changed = budgets.apply(experiment, name)
+  program.say(f'Budget {name}: {budgets.summary(changed)}')
+  if changes := budgets.changes(experiment, name):
+    words = (f'{key} {a} by {b}' for key, (a, b) in changes.items())
+    program.say(f'Budget {name} replaces {", ".join(words)}')
+  machine = machines.here()['processor']
+  program.say(f'This machine: {machine}; code: {sources.digest()}')
+  return changed
 
 
 if __name__ == '__main__':

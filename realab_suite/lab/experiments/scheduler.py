@@ -15,6 +15,7 @@ import yaml
 from realab_suite import errors
 from realab_suite import sources
 from realab_suite.config import loading
+from realab_suite.lab.experiments import budgets
 from realab_suite.lab.experiments import engines
 from realab_suite.lab.experiments import experiment_specs
 from realab_suite.lab.experiments import jobs
@@ -23,7 +24,7 @@ from realab_suite.lab.experiments import training
 
 EXPERIMENT = 'experiment.yaml'
 # The same with its designs, from which jobs run: files may change meanwhile.
-_COPY = 'jobs.yaml'
+COPY = 'jobs.yaml'
 SWEEP = 'sweep.json'
 LOGS = 'logs'
 AUDITS = 'audits'
@@ -105,6 +106,7 @@ def _describe(
       'schema': 1,
       'experiment': experiment.name,
       'calibration': calibration,
+      'budget': None if calibration else budgets.name_of(experiment),
       'jobs': [
           {
               'run': job.run,
@@ -123,7 +125,7 @@ def _describe(
   storage.write_json(output / SWEEP, description)
   storage.write_whole(output / EXPERIMENT, text.encode())
   text = yaml.safe_dump(experiment.to_copy(), sort_keys=False)
-  storage.write_whole(output / _COPY, text.encode())
+  storage.write_whole(output / COPY, text.encode())
 
 
 def check_experiment(
@@ -279,7 +281,7 @@ class _Sweep:
         sys.executable,
         '-m',
         _MODULE,
-        f'--experiment={self._output / _COPY}',
+        f'--experiment={self._output / COPY}',
         f'--run={run.job.run}',
         f'--seed={run.job.seed}',
         f'--output={self._output}',

@@ -312,6 +312,14 @@ def header(digest: str, what: str) -> dict[str, Any]:
   return {'configuration': digest, 'what': what}
 
 
+def evaluation_actor(
+    job: jobs.Job, learner: 'agents.Learner'
+) -> 'LearnerActor':
+  """Returns what acts in the evaluation episodes of a job."""
+  is_greedy = job.experiment.evaluation.actions == 'greedy'
+  return LearnerActor(learner, _told(job, job.evaluation_seed), is_greedy)
+
+
 def _evaluate(
     job: jobs.Job,
     learner: 'agents.Learner | None',
@@ -344,9 +352,7 @@ def _evaluate(
       )
       actor = batch_actors.BatchPolicyActor(policy, batch, seed)
     else:
-      actor = LearnerActor(
-          learner, _told(job, seed), evaluation.actions == 'greedy'
-      )
+      actor = evaluation_actor(job, learner)
     attributions: list[attribution_metrics.AttributionMetrics | None]
     if trace is None:
       outcomes = evaluate.evaluate_batch(batch, actor)
