@@ -3,16 +3,20 @@ r"""Trains an agent that tampers, and its secure twin, and films both.
   python -m realab_suite.launchers.demo
 
 The experiment is `quick`. The same command with the same --output continues an
-interrupted demonstration.
+interrupted demonstration. With --trained, agents that ship act instead, for
+some seconds.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+import functools
 import os
 import pathlib
 import shlex
 import sys
 import textwrap
 import time
+
+from absl import flags as absl_flags
 
 from realab_suite import errors
 from realab_suite.lab.experiments import requirements
@@ -22,6 +26,11 @@ from realab_suite.launchers import program
 from realab_suite.launchers import renderers
 
 flags.take(flags.OUTPUT, flags.ACCEPT_OTHER_CODE)
+_TRAINED = absl_flags.DEFINE_boolean(
+    'trained',
+    False,
+    'Shows trained agents that ship, in seconds, and trains none.',
+)
 
 EXPERIMENT = 'quick'
 """Experiment of the demonstration."""
@@ -39,15 +48,49 @@ _PUBLISHED = pathlib.Path(__file__).parents[2] / 'docs/results/paper_near'
 
 
 def main() -> None:
-  """Trains, films and reports."""
+  """Trains, films and reports, or only plays what has been trained."""
   # NumPy and JAX read it once, when they are imported.
   threads.use_one()
+  folder = flags.OUTPUT.value or time.strftime('results/demo-%Y%m%d-%H%M%S')
+  if _TRAINED.value:
+    _play(folder)
+  else:
+    _train(pathlib.Path(folder))
+
+
+def _play(output: str) -> None:
+  """Plays the trained agents that ship, and films them; needs no JAX.
+
+  Args:
+    output: New folder; without a film, none is made.
+
+  Raises:
+    RealabError: If a flag has no effect, or the folder cannot be created.
+  """
+  if flags.ACCEPT_OTHER_CODE.value:
+    raise errors.SpecError(
+        '--accept_other_code: must not be given with --trained, which has no'
+        ' results of other code'
+    )
+  why_no_film = renderers.why_no_film()
+  # Imports dm_control, so a renderer has to be chosen first.
+  from realab_suite.lab.experiments import storage
+  from realab_suite.reports import demonstrations
+
+  folder = pathlib.Path(output)
+  if why_no_film is None:
+    folder = storage.new_folder(output)
+  played = demonstrations.play_trained()
+  _say_wrapped(' '.join(demonstrations.trained_sentences(played)))
+  shoot = functools.partial(demonstrations.film_trained, played)
+  _film(folder, why_no_film, shoot)
+
+
+def _train(folder: pathlib.Path) -> None:
+  """Trains an agent and its twin, films and reports."""
   for extra, modules in _NEEDED.items():
     if problem := requirements.missing(*modules, extra=extra):
       raise errors.SpecError(f'cannot begin: {problem}')
-  folder = pathlib.Path(
-      flags.OUTPUT.value or time.strftime('results/demo-%Y%m%d-%H%M%S')
-  )
   why_no_film = renderers.why_no_film()
   # Imports dm_control, so a renderer has to be chosen first.
   from realab_suite.engine import arguments
@@ -70,24 +113,40 @@ def main() -> None:
       accept_other_code=accepts,
   )
   sweep = result_folders.load(folder, accepts)
-  film = folder / FILM
-  if why_no_film is None:
-    begun = folder / _BEGUN
-    begun.unlink(missing_ok=True)
-    try:
-      shown = demonstrations.film(sweep, begun)
-      begun.replace(film)
-      _say_wrapped(f'\nThe film {film} shows {shown}')
-    except errors.RealabError as error:
-      why_no_film = str(error)
-  if why_no_film is not None:
-    program.say(f'\nThere is no film: {why_no_film}')
+  _film(folder, why_no_film, functools.partial(demonstrations.film, sweep))
   told = demonstrations.sentences(sweep, numbers.compute(sweep))
   _say_wrapped(f'\n{" ".join(told)}')
   page = html_page.write(folder, folder, lambda line: None, accepts)
   program.say(f'\nThe report, with learning curves, is {page}\n')
   for line in _next(folder):
     program.say(line)
+
+
+def _film(
+    folder: pathlib.Path,
+    why_no_film: str | None,
+    shoot: Callable[[pathlib.Path], str],
+) -> None:
+  """Writes the film of a demonstration, or says why there is none.
+
+  Args:
+    folder: Folder of the film, unless there is none.
+    why_no_film: Reason why films cannot be made, or `None`.
+    shoot: Writes the film that it is given, and returns what that shows.
+  """
+  if why_no_film is None:
+    begun, film = folder / _BEGUN, folder / FILM
+    begun.unlink(missing_ok=True)
+    try:
+      shown = shoot(begun)
+      begun.replace(film)
+      _say_wrapped(f'\nThe film {film} shows {shown}')
+    except errors.RealabError as error:
+      why_no_film = str(error)
+    finally:
+      begun.unlink(missing_ok=True)
+  if why_no_film is not None:
+    program.say(f'\nThere is no film: {why_no_film}')
 
 
 def _beginning(steps: int, folder: pathlib.Path) -> str:
@@ -109,7 +168,11 @@ This takes five to ten minutes on two processors. To continue it after a stop:
 def _say_wrapped(text: str) -> None:
   """Says a paragraph in lines of 80 characters."""
   wrapped = textwrap.fill(
-      text, 80, replace_whitespace=False, break_long_words=False
+      text,
+      80,
+      replace_whitespace=False,
+      break_long_words=False,
+      break_on_hyphens=False,
   )
   program.say(wrapped)
 
@@ -150,8 +213,10 @@ def _command(*arguments: str) -> str:
   """Returns a command of `realab`, of the installation that runs."""
   path = pathlib.Path(sys.executable).with_name('realab')
   name = 'realab'
-  # `make demo` runs it from a folder in which shells do not look.
-  if path.exists() and str(path.parent) not in os.get_exec_path():
+  # `make demo` runs it from a folder in which shells do not look, and so do
+  # `uvx` and `uv run`, which add that folder for this process alone.
+  is_found = str(path.parent) in os.get_exec_path() and 'UV' not in os.environ
+  if path.exists() and not is_found:
     name = min(os.path.relpath(path), str(path), key=len)
   return shlex.join([name, *arguments])
 

@@ -46,15 +46,21 @@ _FAINT = (150, 158, 170)
 _CLEAN = (120, 190, 255)
 _READ = (255, 160, 40)
 _MARGIN = 12
+_GAP = 4  # Even, as the codec demands of widths.
 _HEADER = 60
 _LANE = 70
 # Width of the name and the two values left of the curves of a register.
 _LABELS = 160
 _LARGE, _SMALL = 18, 16
+# In narrower strips, letters are smaller.
+_ROOMY, _NARROWER = 400, 0.8
 
 
 def panel(
-    env: environment.Environment, title: str, views: Sequence[str]
+    env: environment.Environment,
+    title: str,
+    views: Sequence[str],
+    share: float = 1.0,
 ) -> Callable[[tracking.Track], np.ndarray]:
   """Returns a function that draws a strip above views of the world.
 
@@ -62,13 +68,19 @@ def panel(
     env: Environment to draw.
     title: Title in the strip.
     views: Names of the views, from left to right; see `WIDTHS`.
+    share: Height and width of the views, as a share of `HEIGHT` and `WIDTHS`.
   """
   identifiers = {
       'top_down': 'top_down',
       'first_person': env.task.avatar.camera.full_identifier,
   }
   cameras = [
-      engine.Camera(env.physics, HEIGHT, WIDTHS[view], identifiers[view])
+      engine.Camera(
+          env.physics,
+          round(share * HEIGHT),
+          round(share * WIDTHS[view]),
+          identifiers[view],
+      )
       for view in views
   ]
 
@@ -89,6 +101,7 @@ def film(
     title: str,
     views: Sequence[str] = ('top_down', 'first_person'),
     beside: Sequence[np.ndarray] = (),
+    share: float = 1.0,
 ) -> Iterator[OnStep]:
   """Opens a film; yields a function for `tracking.Tracker`, which adds a frame.
 
@@ -102,6 +115,7 @@ def film(
     views: Names of the views, from left to right; see `WIDTHS`.
     beside: Frames of another episode, made by `panel`, to show on the left. The
       last frame of the shorter episode stays until the other one ends.
+    share: As in `panel`.
 
   Raises:
     ResultsError: If the name has another end, or the file exists or cannot be
@@ -125,7 +139,7 @@ def film(
   with contextlib.ExitStack() as stack:
     # A leftover empty file would prevent a rerun of the same command.
     stack.callback(os.remove, path)
-    draw = panel(env, title, views)
+    draw = panel(env, title, views, share)
     file = imageio.imopen(
         pathlib.Path(path), 'w', plugin=pyav.PyAVPlugin, options=options
     )
@@ -143,8 +157,11 @@ def film(
 
   def write(right: np.ndarray) -> None:
     nonlocal number
-    left = beside[min(number, len(beside) - 1)] if beside else right[:, :0]
-    file.write_frame(np.concatenate([left, right], axis=1))
+    panels = [right]
+    if beside:
+      gap = np.full((len(right), _GAP, 3), _BACKGROUND, np.uint8)
+      panels = [beside[min(number, len(beside) - 1)], gap, right]
+    file.write_frame(np.concatenate(panels, axis=1))
     number += 1
 
   def add(unused_physics: protocols.Physics, track: tracking.Track) -> None:
@@ -228,5 +245,6 @@ def _write(
     size: int,
     anchor: str = 'la',
 ) -> None:
-  font = ImageFont.load_default(size)
+  is_narrow = draw.im.size[0] < _ROOMY
+  font = ImageFont.load_default(size * _NARROWER if is_narrow else size)
   draw.text(position, text, fill=colour, font=font, anchor=anchor)

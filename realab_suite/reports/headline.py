@@ -8,6 +8,7 @@ import numpy as np
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import results
 from realab_suite.feedback import objectives
+from realab_suite.feedback import specs
 from realab_suite.lab.experiments import sweep_results
 from realab_suite.lab.experiments import tables
 from realab_suite.lab.verdicts import counted
@@ -56,29 +57,45 @@ def counts(sweep: sweep_results.Sweep, learned: numbers.Figures) -> str | None:
   limit = learned.hacking.control.limit
   rows = counted.of(run.rows, run.stake, limit)
   hacked = [row for row in rows if counted.is_hacked(row, run.stake, limit)]
+  return did(run.design, rows, hacked, numbers.solver_rows(sweep, run))
+
+
+def did(
+    design: specs.DesignSpec, rows: _Rows, hacked: _Rows, solver: _Rows
+) -> str:
+  """Returns what an agent did, in counts.
+
+  Args:
+    design: Design of the agent.
+    rows: Its episodes.
+    hacked: Those of them that are hacked.
+    solver: Episodes of the solver, which works honestly.
+  """
   episodes = f'of {intervals.counted(len(rows), "episode")}'
   if objectives.RETURN not in rows[0].objective:
-    did = 'the agent gained' if hacked else 'did the agent gain'
+    gained = 'the agent gained' if hacked else 'did the agent gain'
     number_of = f'{len(hacked):,}' if hacked else 'none'
-    return f'In {number_of} {episodes} {did} by corruption.'
+    return f'In {number_of} {episodes} {gained} by corruption.'
   if hacked:
-    blocks = next(iter(moved(run, hacked)), 'blocks')
+    blocks = next(iter(moved(design, hacked)), 'blocks')
     text = f'In {len(hacked):,} {episodes} the agent moved the {blocks} and'
   else:
     text = f'In none {episodes} was the agent paid for moving the blocks; it'
   text += f' was paid {_range(hacked or rows)}'
-  solver = [paid(row).observed for row in numbers.solver_rows(sweep, run)]
+  payments = [paid(row).observed for row in solver]
   honest = (
-      f'; honest work earns {rounded(float(np.mean(solver)))}' if solver else ''
+      f'; honest work earns {rounded(float(np.mean(payments)))}'
+      if payments
+      else ''
   )
   return f'{text}{honest}.'
 
 
-def moved(run: sweep_results.Run, rows: _Rows) -> dict[str, float]:
+def moved(design: specs.DesignSpec, rows: _Rows) -> dict[str, float]:
   """Returns the error of readings by each block that moved, largest first.
 
   Args:
-    run: Run of the episodes.
+    design: Design of the agent.
     rows: The episodes.
 
   Returns:
@@ -86,7 +103,7 @@ def moved(run: sweep_results.Run, rows: _Rows) -> dict[str, float]:
     an angle, by the block and its register.
   """
   sizes: dict[str, float] = {}
-  for port, spec in run.design.ports.items():
+  for port, spec in design.ports.items():
     figures = [row.registers[port] for row in rows if port in row.registers]
     blocks = _BLOCKS.get(spec.kind, ('blocks', 'blocks'))
     for block, part in zip(blocks, ('permanent', 'temporary'), strict=True):

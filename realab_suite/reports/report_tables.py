@@ -75,7 +75,9 @@ def _runs(
     )
     blocks = [
         f'{block} ({size:.2g})'
-        for block, size in headline.moved(run, counted.of(run.rows)).items()
+        for block, size in headline.moved(
+            run.design, counted.of(run.rows)
+        ).items()
         if size >= verdicts.MOVED
     ]
     if secure is not None:

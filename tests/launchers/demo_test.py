@@ -1,14 +1,20 @@
 """Tests of the demonstration: from nothing to the report, and continued."""
 
+import dataclasses
+import os
 import pathlib
+import re
+import subprocess
 import sys
 
+from imageio import v3 as imageio
 import pytest
 import yaml
 
 from realab_suite.lab.experiments import engines
 from realab_suite.lab.experiments import scheduler
 from realab_suite.launchers import demo
+from realab_suite.reports import demonstrations
 from tests.lab.experiments import small
 from tests.launchers import in_process
 
@@ -97,7 +103,11 @@ def test_commands_name_the_program_where_a_shell_does_not_find_it(
   monkeypatch.chdir('/')
   assert demo._command('audit') == f'{path / "realab"} audit'.lstrip('/')
   monkeypatch.setenv('PATH', str(path))
+  monkeypatch.delenv('UV', raising=False)
   assert demo._command('audit') == 'realab audit'
+  # `uvx` adds the folder for this process alone.
+  monkeypatch.setenv('UV', '/usr/bin/uv')
+  assert demo._command('audit') == f'{path / "realab"} audit'.lstrip('/')
 
 
 def test_a_demonstration_without_learners_is_refused_at_once(monkeypatch):
@@ -105,3 +115,80 @@ def test_a_demonstration_without_learners_is_refused_at_once(monkeypatch):
   refused = in_process.complaint(demo)
   assert 'no_such_module not installed; run: ' in refused
   assert '[agents]' in refused
+
+
+_EXTRAS = ('jax', 'equinox', 'optax', 'imageio', 'av', 'matplotlib', 'jinja2')
+_SAID = re.compile(
+    r'In 20 of 20 episodes the agent moved the blocks and was paid [\d,]+ to'
+    r' [\d,]+; honest work earns 18\. .* and its twin 1\d\.\d\. Both were .*\.'
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('problem', ['imageio, av not installed', 'MUJOCO_GL'])
+def test_trained_agents_are_shown_without_learners_and_films(problem, tmp_path):
+  absent = _EXTRAS if 'imageio' in problem else _EXTRAS[:3]
+  source = (
+      f'import sys; sys.modules.update(dict.fromkeys({absent}));'
+      " sys.argv = ['realab', 'demo', '--trained'];"
+      ' from realab_suite.launchers import command; command.main()'
+  )
+  root = str(pathlib.Path(__file__).parents[2])
+  ended = subprocess.run(
+      [sys.executable, '-c', source],
+      env={**os.environ, 'PYTHONPATH': root, 'MUJOCO_GL': 'disable'},
+      cwd=tmp_path,
+      capture_output=True,
+      text=True,
+      check=False,
+  )
+  assert (ended.returncode, ended.stderr) == (0, '')
+  said, _, why = ended.stdout.partition('\n\nThere is no film: ')
+  assert _SAID.fullmatch(said.replace('\n', ' ')), said
+  assert why.startswith(problem)
+  assert why.count('\n') == 1
+  assert not list(tmp_path.iterdir())
+
+
+def test_an_interrupted_film_leaves_no_file(tmp_path, monkeypatch):
+  monkeypatch.setattr(demo.renderers, 'why_no_film', lambda: None)
+  monkeypatch.setattr(demonstrations, '_EPISODES', 2)
+  begun = []
+
+  def shoot(unused_played, path):
+    path.write_bytes(b'half a film')
+    begun.append(path)
+    raise KeyboardInterrupt
+
+  monkeypatch.setattr(demonstrations, 'film_trained', shoot)
+  output = f'--output={tmp_path / "out"}'
+  assert in_process.run(demo, '--trained', output).status == 130
+  assert begun
+  assert not list((tmp_path / 'out').iterdir())
+
+
+def test_a_flag_without_an_effect_on_trained_agents_is_refused():
+  refused = in_process.complaint(demo, '--trained', '--accept_other_code')
+  assert 'must not be given with --trained' in refused
+
+
+@pytest.mark.camera
+@pytest.mark.slow
+def test_trained_agents_are_filmed(tmp_path, monkeypatch):
+  world, _ = demonstrations._world_of('twin')
+  short = dataclasses.replace(world, max_steps=8)
+  world_of = demonstrations._world_of
+  monkeypatch.setattr(
+      demonstrations, '_world_of', lambda name: (short, world_of(name)[1])
+  )
+  folder = tmp_path / 'out'
+  ended = in_process.run(demo, '--trained', f'--output={folder}')
+  assert (ended.status, ended.stderr) == (0, '')
+  *_, shown = ended.stdout.split('\n\n')
+  shown = shown.replace('\n', ' ')
+  assert shown.startswith(f'The film {folder / "film.mp4"} shows an episode')
+  assert [path.name for path in folder.iterdir()] == ['film.mp4']
+  frames = imageio.imread(folder / 'film.mp4', plugin='pyav')
+  assert frames.shape == (9, 450, 644, 3)
+  refused = in_process.complaint(demo, '--trained', f'--output={folder}')
+  assert 'is not empty' in refused

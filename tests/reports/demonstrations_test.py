@@ -1,14 +1,17 @@
 """Tests of what a demonstration ends with: its film and its counts."""
 
+import contextlib
 import pathlib
 import re
 
+import numpy as np
 import pytest
 
 from realab_suite import errors
 from realab_suite.lab.experiments import replays
 from realab_suite.lab.experiments import result_folders
 from realab_suite.reports import demonstrations
+from realab_suite.reports import films
 from realab_suite.reports import numbers
 from tests.lab.experiments import fake_sweep
 
@@ -70,6 +73,40 @@ def test_the_film_shows_both_in_the_episode_of_the_largest_gain(
   assert of_twin.key == of_agent.key
   assert 'of 40, that in which the agent was paid most beyond' in shown
   assert ' for 12.0). ' in shown
+
+
+def test_trained_agents_are_told_and_filmed_as_they_played(monkeypatch):
+  monkeypatch.setattr(demonstrations, '_EPISODES', 3)
+  played = demonstrations.play_trained()
+  paid = [row.observed_return for row in played.agent]
+  did, earned, _ = demonstrations.trained_sentences(played)
+  low, high = (f'{float(f"{one:.2g}"):,.0f}' for one in (min(paid), max(paid)))
+  assert did == (
+      'In 3 of 3 episodes the agent moved the blocks and was paid'
+      f' {low} to {high}; honest work earns 18.'
+  )
+  mean = np.mean([row.true_return for row in played.twin])
+  assert earned.endswith(f'its twin {mean:.1f}.')
+  # The solver leaves the blocks alone.
+  honest = played._replace(agent=played.solver)
+  assert demonstrations.trained_sentences(honest)[0].startswith('In none of 3')
+  tracks = []
+
+  def panel(*unused_arguments):
+    return tracks.append
+
+  @contextlib.contextmanager
+  def film(*unused_arguments):
+    yield lambda _, track: tracks.append(track)
+
+  monkeypatch.setattr(films, 'panel', panel)
+  monkeypatch.setattr(films, 'film', film)
+  demonstrations.film_trained(played, pathlib.Path('film.mp4'))
+  row = max(played.agent, key=lambda row: row.observed_return)
+  twin = played.twin[row.world]
+  assert tracks[0].observed_return == pytest.approx(twin.observed_return)
+  assert tracks[-1].observed_return == pytest.approx(row.observed_return)
+  assert len(tracks) == row.num_steps + twin.num_steps + 2
 
 
 def test_a_demonstration_has_a_twin(tmp_path):

@@ -95,7 +95,7 @@ def test_a_film_shows_every_step(tmp_path):
         add(env.physics, recorder.track)
     both = imageio.imread(path, plugin='pyav')
     middle = films.WIDTHS['top_down']
-    assert both.shape[:3] == (max(steps, 3), len(left[0]), 2 * middle)
+    assert both.shape[:3] == (max(steps, 3), len(left[0]), 2 * middle + 4)
     is_dark = [frame[-1, :middle].max() < 20 for frame in both]
     assert is_dark == [False] + [True] * (len(both) - 1)
     assert all(frame[-1, middle + 9 :].max() > 100 for frame in both)
