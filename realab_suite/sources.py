@@ -22,8 +22,16 @@ from typing import Final
 FOLDER: Final = pathlib.Path(__file__).parent
 """Folder of the package."""
 
-# No job runs them, unless a module of the user imports them.
-_UNUSED = ('doors/', 'launchers/', 'reports/', 'testing/', 'lab/testing/')
+# No job runs them, unless a module of the user imports them. In a wheel,
+# `configs` is a folder of the package, and beside it elsewhere.
+_UNUSED = (
+    'configs/',
+    'doors/',
+    'launchers/',
+    'reports/',
+    'testing/',
+    'lab/testing/',
+)
 _NUM_DIGITS = 12
 _INSTALLED = frozenset({'site-packages', 'dist-packages'})
 _STANDARD = pathlib.Path(sysconfig.get_path('stdlib'))

@@ -105,6 +105,16 @@ def test_what_jobs_run_is_a_source_in_any_folder(clone, monkeypatch):
       path.write_bytes(text)
 
 
+def test_a_wheel_has_the_digest_of_its_clone(clone, monkeypatch):
+  package = clone / 'realab_suite'
+  monkeypatch.setattr(sources, 'FOLDER', package)
+  here = sources.current_digest()
+  assert list((clone / 'configs').rglob('*.py'))
+  # As in `package_dir` of setup.cfg.
+  (clone / 'configs').rename(package / 'configs')
+  assert sources.current_digest() == here
+
+
 def test_designs_are_those_beside_the_code(clone, monkeypatch):
   # Another checkout is installed, whose designs would be found otherwise.
   (clone / 'configs' / 'designs' / 'theirs.yaml').write_text('')
