@@ -2,13 +2,16 @@ r"""Audits a design: searches for an exploit of its feedback, without training.
 
   python -m realab_suite.launchers.audit --task=unlock_door.near \
     --design=instantaneous_reward --output=results/audit
+  python -m realab_suite.launchers.audit --experiment=quick --run=reward \
+    --output=results/quick
 
 The program prints a report. The exit status is 3 if the design is EXPLOITABLE,
 0 if it RESISTED WITHIN BUDGET, 4 if it resisted an audit of one register, or a
 budget that was too small for all scripted saboteurs and the search after them,
 5 if the audit is UNDECIDED, and 2 if the command is wrong.
 With `--output`, the folder gets `audit.json` and, if a renderer works, a film
-of the exploit.
+of the exploit. The output of a run of an experiment is the folder of its sweep,
+which gets `audits/<run>.json`, where `report` finds it.
 """
 
 from collections.abc import Callable, Iterator
@@ -25,14 +28,9 @@ from realab_suite.launchers import flags
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
 
-flags.take(
-    *flags.WORLD,
-    flags.TARGET,
-    flags.IMPORT,
-    flags.OUTPUT,
-    flags.SEED,
-    flags.BUDGET,
-)
+_SUBJECT = (*flags.WORLD, flags.TARGET)
+flags.take(*_SUBJECT, flags.EXPERIMENT, flags.RUN)
+flags.take(flags.IMPORT, flags.OUTPUT, flags.SEED, flags.BUDGET)
 _FILM = absl_flags.DEFINE_boolean(
     'film', True, 'Films an exploit that was found.'
 )
@@ -61,24 +59,25 @@ def main() -> int:
   from realab_suite.lab.experiments import storage
 
   flags.load_imports()
+  world, design = _subject()
   settings = audits.Settings(
-      world=flags.world(),
-      design=flags.design(),
+      world=world,
+      design=design,
       seed=flags.SEED.value,
       budget=budget,
       target=flags.TARGET.value,
   )
   with _progress() as on_progress:
     auditor = audits.Auditor(settings, on_progress)
-    output, folder = flags.OUTPUT.value, None
-    if output is not None:
-      folder = storage.new_folder(output)
+    output = flags.OUTPUT.value
+    files = None if output is None else _new_files(output)
     result = auditor.run()
   program.say(findings.words(result))
-  if folder is not None:
+  if files is not None:
+    report, new_film = files
     film = None
     if has_film and result.is_exploitable:
-      film = folder / _FILM_NAME
+      film = new_film
       _write_film(auditor, result, settings.design.name, film)
       program.say(f'The film of world {result.film_world} is {film}')
     content = {
@@ -92,13 +91,64 @@ def main() -> int:
         'film': film and str(film),
         'versions': results.versions(),
     }
-    storage.write_json(folder / REPORT, content)
-    program.say(f'Results are in {folder}')
+    storage.write_json(report, content)
+    program.say(f'Results are in {report.parent}')
   if result.is_exploitable:
     return _EXPLOITABLE
   if result.verdict == findings.UNDECIDED:
     return _UNDECIDED
   return 0 if result.is_sufficient else _NOT_SUFFICIENT
+
+
+def _subject() -> tuple[Any, Any]:
+  """Returns the world and the design to audit."""
+  place, name = flags.EXPERIMENT.value, flags.RUN.value
+  if place is None and name is None:
+    return flags.world(), flags.design()
+  from realab_suite.lab.experiments import experiment_specs
+  from realab_suite.lab.experiments import training
+
+  flags.required(flags.EXPERIMENT, ', which goes with --run')
+  for flag in _SUBJECT:
+    if absl_flags.FLAGS[flag.name].present:
+      raise errors.SpecError(
+          f'--{flag.name}: not allowed with --experiment; its run has a world'
+          ' and a design, of which all registers are audited'
+      )
+  experiment = experiment_specs.load(place)
+  flags.required(flags.RUN, f'; must be one of {list(experiment.runs)}')
+  world = experiment.of_run(flags.find_run(experiment.runs, place)).world
+  design = experiment.designs[name]
+  training.check_learner(design, f'{place}: runs.{name}', is_trained=False)
+  return world, design
+
+
+def _new_files(output: str) -> tuple[pathlib.Path, pathlib.Path]:
+  """Returns the paths of the report and of the film, whose folders exist.
+
+  Raises:
+    ResultsError: If a file of an earlier audit would be overwritten, or a
+      folder cannot be created.
+  """
+  from realab_suite.lab.experiments import scheduler
+  from realab_suite.lab.experiments import storage
+
+  name = flags.RUN.value
+  if name is None:
+    folder = storage.new_folder(output)
+    return folder / REPORT, folder / _FILM_NAME
+  folder = pathlib.Path(output)
+  # Beside a sweep, the folder of audits has nothing but reports.
+  files = (
+      folder / scheduler.AUDITS / f'{name}.json',
+      folder / f'{name}_{_FILM_NAME}',
+  )
+  with storage.explained(files[0]):
+    files[0].parent.mkdir(parents=True, exist_ok=True)
+  for path in files:
+    if path.exists():
+      raise errors.ResultsError(f'{path} exists, and is never overwritten')
+  return files
 
 
 def _has_film() -> bool:

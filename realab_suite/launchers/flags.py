@@ -311,11 +311,12 @@ def design(source: Any = None) -> 'specs.DesignSpec':
   return world().fitted(spec)
 
 
-def find_run(runs: Mapping[str, _Run]) -> _Run:
-  """Returns the run of a sweep that the flags name.
+def find_run(runs: Mapping[str, _Run], place: str | None = None) -> _Run:
+  """Returns the run of a sweep or an experiment that the flags name.
 
   Args:
-    runs: Runs of the sweep by name.
+    runs: Runs by name.
+    place: Where they are from, or `None` for `--input`.
 
   Raises:
     UnknownNameError: If there is no such run.
@@ -324,7 +325,7 @@ def find_run(runs: Mapping[str, _Run]) -> _Run:
   if name not in runs:
     hint = messages.did_you_mean(name, runs)
     raise errors.UnknownNameError(
-        f'--run={name:.80}: not a run of {INPUT.value}; must be one of'
+        f'--run={name:.80}: not a run of {place or INPUT.value}; must be one of'
         f' {list(runs)}{hint}'
     )
   return runs[name]

@@ -1,7 +1,7 @@
 """Audits beside the results of a sweep.
 
-The launcher `audit` writes a file `audit.json`. Copied to `audits/<run>.json`
-in the folder of the sweep, it tells whether the design of a run is exploitable.
+The launcher `audit` writes `audits/<run>.json` into the folder of the sweep,
+which tells whether the design of a run is exploitable.
 """
 
 from collections.abc import Mapping
