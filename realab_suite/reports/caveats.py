@@ -28,8 +28,8 @@ def caveats(
       ' their hack rates have a standard deviation of at most 8 points, and'
       ' more if they differ by more.',
       'A design that tampers here should not be trusted elsewhere. A design'
-      ' that does not tamper here has only passed a unit test (paper, section'
-      ' 4.5).',
+      ' that does not tamper here has only passed a unit test (REALab paper,'
+      ' section 4.5).',
   ]
 
 

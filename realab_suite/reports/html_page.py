@@ -1,6 +1,6 @@
 """HTML page of a report: one file, beside the films of its runs."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 import pathlib
 import shutil
 
@@ -25,12 +25,16 @@ SEEDS_CSV = 'seeds.csv'
 # Film of a demonstration, which has one learned run.
 _FILM = 'film.mp4'
 
+View = Callable[[sweep_results.Sweep, Mapping[str, numbers.Figures]], str]
+"""Returns the figures of a sweep in another format."""
+
 
 def write(
     folder: pathlib.Path,
     output: pathlib.Path,
     say: Callable[[str], None],
     accept_other_code: bool = False,
+    more: Mapping[str, View] | None = None,
 ) -> pathlib.Path:
   """Writes the report of a sweep.
 
@@ -39,6 +43,7 @@ def write(
     output: Folder to write into.
     say: Called with a line on each step of the work.
     accept_other_code: True to accept results of different code.
+    more: Contents of files to write beside the page, by their names.
 
   Returns:
     The path of the page.
@@ -109,6 +114,7 @@ def write(
       (CSV, report_tables.csv_text(figures)),
       (SEEDS_CSV, report_tables.seeds_csv_text(figures)),
       (PAGE, page),
+      *((name, view(sweep, figures)) for name, view in (more or {}).items()),
   ):
     storage.write_whole(output / name, content.encode())
   for line in said:
