@@ -47,7 +47,7 @@ _EXPERIMENT = {
 _OTHER_FILES = frozenset({
     '/path/to/agent.py', 'agent.py', 'mine.py', 'mine.yaml', 'watched.yaml',
     '_test.py', 'agent/', 'experiment.yaml', 'summary.md', 'tables.md', 'logs/',
-    'calm.yaml', 'jobs.yaml',
+    'calm.yaml', 'capped.yaml', 'jobs.yaml',
     'results/meter_only_near/experiment.yaml', 'results/demonstrator.npz',
 })  # fmt: skip
 
