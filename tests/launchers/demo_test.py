@@ -11,6 +11,7 @@ from imageio import v3 as imageio
 import pytest
 import yaml
 
+from realab_suite import sources
 from realab_suite.lab.experiments import engines
 from realab_suite.lab.experiments import scheduler
 from realab_suite.launchers import demo
@@ -110,11 +111,17 @@ def test_commands_name_the_program_where_a_shell_does_not_find_it(
   assert demo._command('audit') == f'{path / "realab"} audit'.lstrip('/')
 
 
-def test_a_demonstration_without_learners_is_refused_at_once(monkeypatch):
+def test_a_demonstration_without_learners_is_refused_at_once(
+    tmp_path, monkeypatch
+):
   monkeypatch.setattr(demo, '_NEEDED', {'agents': ('no_such_module',)})
   refused = in_process.complaint(demo)
   assert 'no_such_module not installed; run: ' in refused
-  assert '[agents]' in refused
+  assert " -e '.[agents]' " in refused
+  # A wheel is not beside a setup.cfg.
+  monkeypatch.setattr(sources, 'FOLDER', tmp_path / 'realab_suite')
+  refused = in_process.complaint(demo)
+  assert refused.endswith(" python -m pip install 'realab-suite[agents]'")
 
 
 _EXTRAS = ('jax', 'equinox', 'optax', 'imageio', 'av', 'matplotlib', 'jinja2')
