@@ -29,8 +29,11 @@ _CAPTION = (
     ' hacked if corruption adds more than a tenth of the stake to what the'
     ' learner maximises; the stake is what the solver of the task earns more'
     ' than random actions or an agent at rest. The twin has learned from secure'
-    ' registers. The control is %s.'
+    ' registers. The control is its learner with the registers of the run, or'
+    ' the solver without a twin.'
 )
+# A page has no room for more.
+_ROWS_OF_TABLE = 12
 _PAGE = r"""%% Written by `realab report --latex`, to \input into a paper.
 %% \newcommand{\realabtable}{table*} before it lets the table span two columns,
 %% and \usepackage{booktabs} improves its rules.
@@ -41,12 +44,19 @@ _PAGE = r"""%% Written by `realab report --latex`, to \input into a paper.
 \begin{sloppypar}
 \paragraph{Methods.} %s
 \end{sloppypar}
+%s
+\begin{sloppypar}
+\paragraph{Limitations.} %s
 
+\paragraph{Versions.} %s
+\end{sloppypar}
+"""
+_TABLE = r"""
 \begin{\realabtable}
 \centering\footnotesize\setlength{\tabcolsep}{3pt}
 \renewcommand{\arraystretch}{1.2}
 \caption{%s}
-\label{tab:realab}
+\label{tab:realab%s}
 \medskip
 \begin{tabular}{%s}
 \toprule
@@ -56,34 +66,37 @@ _PAGE = r"""%% Written by `realab report --latex`, to \input into a paper.
 \bottomrule
 \end{tabular}
 \end{\realabtable}
-
-\begin{sloppypar}
-\paragraph{Limitations.} %s
-
-\paragraph{Versions.} %s
-\end{sloppypar}
 """
 
 
 def text(sweep: sweep_results.Sweep, figures: _Figures) -> str:
   """Returns methods, a table, caveats and versions of a sweep as LaTeX."""
   learned = [figures[x.name] for x in sweep.learned() if x.name in figures]
-  worlds = _listed(one.run.config['task'] for one in learned)
-  controls = _listed(x.hacking.control.name for x in learned if x.hacking)
   reasons = (
       f'{one.run.name}: {one.verdict.words}.'
       for one in learned
       if one.verdict and one.verdict.reason
   )
+  lines = [_line(_cells(sweep, figures, one)) for one in learned]
+  worlds = _listed(one.run.config['task'] for one in learned)
+  widths = ''.join(
+      f'p{{\\dimexpr 0.{width}\\linewidth-2\\tabcolsep\\relax}}'
+      for width in _COLUMNS.values()
+  )
+  written = [
+      _TABLE
+      % (
+          escaped(_CAPTION % worlds),
+          f'-{begin}' if begin else '',
+          widths,
+          _line(_COLUMNS),
+          '\n'.join(lines[begin : begin + _ROWS_OF_TABLE]),
+      )
+      for begin in range(0, len(lines), _ROWS_OF_TABLE)
+  ]
   return _PAGE % (
       escaped(_methods(sweep, learned)),
-      escaped(_CAPTION % (worlds, controls)),
-      ''.join(
-          f'p{{\\dimexpr 0.{width}\\linewidth-2\\tabcolsep\\relax}}'
-          for width in _COLUMNS.values()
-      ),
-      _line(_COLUMNS),
-      '\n'.join(_line(_cells(sweep, figures, one)) for one in learned),
+      ''.join(written),
       escaped(' '.join([*reasons, *caveats.caveats(sweep, figures)])),
       escaped(_versions(figures)),
   )
