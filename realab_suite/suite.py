@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, final
 import warnings
 
 from dm_control import composer
-from dm_control.rl import control
 import mujoco
 import numpy as np
 
@@ -376,18 +375,6 @@ def load_batch(
   return batch
 
 
-def _task_of(environment: Any) -> Any:
-  """Returns the task of an environment below up to 10 wrappers, or `None`."""
-  for _ in range(10):
-    if hasattr(environment, 'task'):
-      return environment.task
-    fields = getattr(environment, '__dict__', {})
-    # Wrappers of Gymnasium, Shimmy and dm_env use these names.
-    names = {'env', '_env', '_environment'} & fields.keys()
-    environment = fields[names.pop()] if names else None
-  return None
-
-
 def embed(
     task: composer.Task,
     design: specs.Design,
@@ -422,15 +409,11 @@ def embed(
     SpecError: If the design is wrong or does not fit the task.
   """
   if not isinstance(task, composer.Task):
-    hint = ''
-    if isinstance(task, type):
-      hint = '; this is a class: pass an instance'
-    elif isinstance(found := _task_of(task), composer.Task):
-      hint = '; this is an environment: pass its `.task`'
-    elif isinstance(found or task, control.Task):
-      hint = '; tasks of dm_control.suite are no Composer tasks'
+    from realab_suite.engine import foreign
+
     raise errors.SpecError(
-        f'task: {messages.quote(task)}; must be a Composer task{hint}'
+        f'task: {messages.quote(task)}; must be a Composer task'
+        f'{foreign.hint(task)}'
     )
   if isinstance(task.observables, list | tuple):
     raise errors.SpecError(

@@ -14,6 +14,7 @@ from typing import Any, final
 from dm_control import composer
 from dm_control import mjcf
 from dm_control.composer import observation as composer_observation
+from dm_control.rl import control
 from dm_env import specs
 import mujoco
 import numpy as np
@@ -292,3 +293,27 @@ def check_start(
           f' be {depth:.2g} m inside {name!r} when the episode begins; place it'
           ' elsewhere'
       )
+
+
+def hint(given: Any) -> str:
+  """Returns what to pass instead of something that is no Composer task."""
+  if isinstance(given, type):
+    return '; this is a class: pass an instance'
+  found = _task_of(given)
+  if isinstance(found, composer.Task):
+    return '; this is an environment: pass its `.task`'
+  if isinstance(found or given, control.Task):
+    return '; tasks of dm_control.suite are no Composer tasks'
+  return ''
+
+
+def _task_of(environment: Any) -> Any:
+  """Returns the task of an environment below up to 10 wrappers, or `None`."""
+  for _ in range(10):
+    if hasattr(environment, 'task'):
+      return environment.task
+    fields = getattr(environment, '__dict__', {})
+    # Wrappers of Gymnasium, Shimmy and dm_env use these names.
+    names = {'env', '_env', '_environment'} & fields.keys()
+    environment = fields[names.pop()] if names else None
+  return None

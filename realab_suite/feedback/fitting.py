@@ -7,17 +7,39 @@ that a design usually has.
 from collections.abc import Iterable, Iterator, Mapping
 import contextlib
 import math
-from typing import Any
+from typing import Any, Final
 
 from realab_suite import errors
+from realab_suite.config import loading
 from realab_suite.config import messages
 from realab_suite.feedback import measurements
+
+USUAL: Final = 'usual'
+"""Key of a range that gives way to what a world declares."""
 
 _Range = measurements.Range
 
 # Largest distance of a block from its place for 0 at the lower end, and between
 # both ends, in m (rad for an orientation). The places of rooms have this much.
 _BELOW, _IN_ALL = 0.4, 2.0
+
+
+def read_range(data: Any) -> tuple[Any, bool]:
+  """Returns the data of a register with plain ends, and whether it states them.
+
+  Args:
+    data: Data whose range may be `{usual: [low, high]}`.
+  """
+  given = data.get('range') if isinstance(data, Mapping) else None
+  if not isinstance(given, Mapping) or USUAL not in given:
+    return data, True
+  ends: Any = given[USUAL]
+  # An override of one end states both.
+  if loading.is_list(ends) and given.keys() <= {USUAL, '0', '1'}:
+    ends = [given.get(str(i), end) for i, end in enumerate(ends)]
+  else:
+    ends = given
+  return {**data, 'range': ends}, len(given) > 1
 
 
 def holds(available: _Range, needed: _Range) -> bool:

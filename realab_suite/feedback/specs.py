@@ -32,9 +32,6 @@ Coordinate = Annotated[float, pydantic.Field(ge=-1e4, le=1e4)]
 # number. MuJoCo reserves 160 MB for their contacts, quadratic in the number.
 MAX_REGISTERS = 100
 
-# Key of a range that gives way to what a world declares.
-_USUAL = 'usual'
-
 READ_BY_AGENTS = consistency.READ_BY_AGENTS
 WRITTEN_BY_PROVIDERS = consistency.WRITTEN_BY_PROVIDERS
 
@@ -114,18 +111,9 @@ class RegisterSpec(arguments.Arguments):
   @classmethod
   def _usual_range(cls, data: Any, handler: Any) -> 'RegisterSpec':
     """Accepts `{usual: [low, high]}` for a range that is not stated."""
-    given = data.get('range') if isinstance(data, Mapping) else None
-    if not isinstance(given, Mapping) or _USUAL not in given:
-      made: RegisterSpec = handler(data)
-      return made
-    ends: Any = given[_USUAL]
-    # An override of one end states both.
-    if loading.is_list(ends) and given.keys() <= {_USUAL, '0', '1'}:
-      ends = [given.get(str(i), end) for i, end in enumerate(ends)]
-    else:
-      ends = given
-    made = handler({**data, 'range': ends})
-    if len(given) == 1:
+    data, is_stated = fitting.read_range(data)
+    made: RegisterSpec = handler(data)
+    if not is_stated:
       made.model_fields_set.discard('range')
     return made
 
@@ -430,7 +418,8 @@ class DesignSpec(validation.Spec):
       return self
     data = self.to_source()
     for name, (ends, scale) in changes.items():
-      data['registers'][name] |= {'range': {_USUAL: [*ends]}, 'scale': scale}
+      open_range = {fitting.USUAL: [*ends]}
+      data['registers'][name] |= {'range': open_range, 'scale': scale}
     where = f'design {self.name!r}, with the ranges that this world needs'
     return validation.validate(DesignSpec, data, where)
 
@@ -446,7 +435,7 @@ class DesignSpec(validation.Spec):
       if 'initial' not in spec.model_fields_set:
         del source['initial']
       if 'range' not in spec.model_fields_set:
-        source['range'] = {_USUAL: source['range']}
+        source['range'] = {fitting.USUAL: source['range']}
     return data
 
   def channel_of(self, name: str) -> arguments.Channel:
