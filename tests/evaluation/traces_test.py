@@ -25,6 +25,7 @@ def _trace(policy):
 
 def test_the_actions_of_a_trace_repeat_the_episode():
   trace, results = _trace('carrying_saboteur')
+  assert len(results) == _NUM_ENVS
   for world, result in enumerate(results):
     env = suite.load(
         *_TASK, {'random': 7}, {'max_steps': 40, 'world': world},

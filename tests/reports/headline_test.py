@@ -110,6 +110,8 @@ def test_controls_get_no_label(five):
 def test_the_onset_is_relative_to_the_control(five):
   _, figures = _lines(five)
   run = figures['reward'].run
+  for name in ('reward', 'decoupled'):
+    assert list(figures[name].seeds) == [0, 1, 2, 3, 4]
   for number, seed in figures['reward'].seeds.items():
     # The first point of the made-up curve has no gain.
     assert seed.onset == run.curves[number][1]['step']

@@ -93,8 +93,11 @@ def test_a_value_that_is_no_answer_is_dropped(tmp_path, value):
     if content['type'] == 'step' and content['step'] == 2:
       page.answer('approval', value)
 
+  page = FakePage(react)
   design = supervised_designs.design('approval')
-  _, answers = _supervise(FakePage(react), tmp_path, design, 4)
+  _, answers = _supervise(page, tmp_path, design, 4)
+  assert page.steps() == [0, 1, 2, 3, 4]
+  assert page.receive(0) is None
   assert not [one for one in answers if one['asks'] == 'approval']
 
 

@@ -140,15 +140,20 @@ def test_a_flat_observation_is_that_of_gymnasiums_wrapper():
 
 
 def test_the_reward_is_zero_or_the_reading_of_a_register():
-  silent, paid = _make(), _make(reward_register='reward')
+  long = {'environment_kwargs': {'max_steps': 100}}
+  silent, paid = _make(**long), _make(reward_register='reward', **long)
   for env in (silent, paid):
     env.reset(seed=1)
-  for _ in range(_MAX_STEPS):
+  rewards = []
+  # The way ahead leads to an apple.
+  for _ in range(100):
     action = np.ones(6, np.float32)
     assert silent.step(action)[1] == 0.0
     observation, reward, *_, info = paid.step(action)
     assert np.float32(reward) == observation['registers_reward'][0]
     assert info == {}
+    rewards.append(reward)
+  assert max(rewards) == pytest.approx(1.0)
 
 
 def test_the_time_limit_truncates_and_the_next_step_needs_a_reset():

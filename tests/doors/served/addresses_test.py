@@ -60,8 +60,13 @@ def test_the_socket_of_a_killed_server_is_reused(tmp_path):
     killed.bind(str(tmp_path / 'socket'))
   server = agent_server.Server(_Nothing(), f'unix:{tmp_path}/socket')
   server.start()
+  thread = threading.Thread(target=server.run)
+  thread.start()
+  stream = served.RawStream(server.address)
+  assert stream.ask(b'echo') == b'echo'
+  stream.close()
   server.stop()
-  server.run()
+  thread.join()
   assert not (tmp_path / 'socket').exists()
 
 

@@ -40,9 +40,12 @@ def fixture_recorded(env):
 
 
 def test_every_step_has_a_reading_and_the_places_of_the_blocks(recorded):
-  _, track = recorded
+  result, track = recorded
+  assert track.registers.keys() == {'reward', 'score'}
   for register in track.registers.values():
-    assert np.isfinite(register.reading[1:]).all()
+    readings = np.array(register.reading[1:])
+    assert readings.shape == (result.num_steps,)
+    assert np.isfinite(readings).all()
     assert len(register.blocks) == track.num_steps + 1
 
 
