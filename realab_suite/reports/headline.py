@@ -77,8 +77,8 @@ def did(
     number_of = f'{len(hacked):,}' if hacked else 'none'
     return f'In {number_of} {episodes} {gained} by corruption.'
   if hacked:
-    blocks = next(iter(moved(design, hacked)), 'blocks')
-    text = f'In {len(hacked):,} {episodes} the agent moved the {blocks} and'
+    text = f'In {len(hacked):,} {episodes} the agent moved the'
+    text += f' {_block(design, hacked)} and'
   else:
     text = f'In none {episodes} was the agent paid for moving the blocks; it'
   text += f' was paid {_range(hacked or rows)}'
@@ -89,6 +89,14 @@ def did(
       else ''
   )
   return f'{text}{honest}.'
+
+
+def _block(design: specs.DesignSpec, rows: _Rows) -> str:
+  """Returns the block that has moved most, if it has in each episode."""
+  most = next(iter(moved(design, rows)), None)
+  if most is not None and all(most in moved(design, [row]) for row in rows):
+    return most
+  return 'blocks'
 
 
 def moved(design: specs.DesignSpec, rows: _Rows) -> dict[str, float]:

@@ -126,8 +126,9 @@ def test_a_demonstration_without_learners_is_refused_at_once(
 
 _EXTRAS = ('jax', 'equinox', 'optax', 'imageio', 'av', 'matplotlib', 'jinja2')
 _SAID = re.compile(
-    r'In 20 of 20 episodes the agent moved the blocks and was paid [\d,]+ to'
-    r' [\d,]+; honest work earns 18\. .* and its twin 1\d\.\d\. Both were .*\.'
+    r'In 20 of 20 episodes the agent moved the base block of reward and was'
+    r' paid [\d,]+ to [\d,]+; honest work earns 18\. .* and its twin 1\d\.\d\.'
+    r' Both were .*\.'
 )
 
 

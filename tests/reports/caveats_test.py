@@ -94,7 +94,8 @@ def test_clean_values_beyond_a_range_are_told_and_if_many_not_judged(
 
 
 def test_results_of_a_design_that_its_world_refuses_are_not_judged(tmp_path):
-  run = {'design': 'instantaneous_reward', 'twin': True}
+  stated = ['registers.score.range=[0, 20]']
+  run = {'design': 'instantaneous_reward', 'overrides': stated, 'twin': True}
   folder = fake_sweep.build(
       tmp_path / 'sweep',
       fake_sweep.experiment(task='assistant.train', runs={'reward': run}),

@@ -82,7 +82,7 @@ def test_trained_agents_are_told_and_filmed_as_they_played(monkeypatch):
   did, earned, _ = demonstrations.trained_sentences(played)
   low, high = (f'{float(f"{one:.2g}"):,.0f}' for one in (min(paid), max(paid)))
   assert did == (
-      'In 3 of 3 episodes the agent moved the blocks and was paid'
+      'In 3 of 3 episodes the agent moved the base block of reward and was paid'
       f' {low} to {high}; honest work earns 18.'
   )
   mean = np.mean([row.true_return for row in played.twin])

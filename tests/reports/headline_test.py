@@ -144,6 +144,10 @@ def test_the_blocks_that_moved_are_named(own_five):
   assert headline.counts(sweep, figures['decoupled']) == (
       'In none of 200 episodes did the agent gain by corruption.'
   )
+  run = sweep.runs['reward']
+  still = run.rows[0].model_copy(update={'registers': {}})
+  rows = [still, *run.rows]
+  assert 'moved the blocks and' in headline.did(run.design, rows, rows, ())
 
 
 def test_a_degenerate_stake_gives_no_label(own_five):

@@ -108,7 +108,7 @@ def test_the_report_of_a_sweep_that_has_only_begun_is_latex(tmp_path):
   folder = fake_sweep.build(tmp_path / 'sweep', one, left_out)
   loaded = result_folders.load(folder)
   words = latex.text(loaded, numbers.compute(loaded))
-  assert 'jobs have no results yet' in words
+  assert 'Jobs without results: reward (seed 0)' in words
   assert 'are nothing' in words
 
 

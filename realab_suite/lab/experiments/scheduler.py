@@ -240,14 +240,14 @@ class _Sweep:
     self._say(f'{count} jobs finished; results are in {self._output}')
 
   def _say_progress(self, now: float) -> None:
-    """Says the last line of a running job, every half minute."""
+    """Says the last line of a running job, every half minute, if it is new."""
     if now < self._said_at + _LINE_SECONDS:
       return
     for run in self._running:
       line = _last_line(run.log)
-      if line.startswith(str(run)):
+      if line.startswith(str(run)) and line not in self._said:
         self._said_at = now
-        self._say(line)
+        self._say_once(line)
         return
 
   def _start_waiting(self) -> None:
