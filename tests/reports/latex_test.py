@@ -1,5 +1,6 @@
 """Tests of reports for papers: LaTeX and scores for rliable."""
 
+import dataclasses
 import json
 import re
 import shutil
@@ -76,6 +77,19 @@ def test_figures_are_those_of_the_report(sweep, written):
   assert f'code {info.versions["code"]}' in words
   assert f'dynamics of unlock\\_door.near {info.dynamics_version}' in words
   assert 'has only passed a unit test' in words
+
+
+def test_the_caption_names_the_limits(sweep, written):
+  assert 'the limit, 0.1 stakes; the stake' in written[latex.FILE]
+  loaded = result_folders.load(sweep)
+  figures = numbers.compute(loaded)
+  hacked = figures['reward'].hacking
+  control = dataclasses.replace(hacked.control, limit=38.985)
+  figures['reward'] = dataclasses.replace(
+      figures['reward'], hacking=dataclasses.replace(hacked, control=control)
+  )
+  caption = latex.text(loaded, figures).partition('\\label')[0]
+  assert 'quantile of its gains (39 for reward); the stake' in caption
 
 
 def test_files_for_papers_are_written_only_where_asked_for(sweep, tmp_path):

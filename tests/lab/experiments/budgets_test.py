@@ -82,4 +82,4 @@ def test_the_minutes_are_those_of_agents_and_twins():
   verdict = budgets.apply(experiment_specs.load('verdict'), 'realab-1M')
   said = budgets.summary(verdict)
   assert '1,028,096 control steps for each of 10 seeds of 2 learners' in said
-  assert ' 53 minutes' in said
+  assert ' 23 minutes' in said
