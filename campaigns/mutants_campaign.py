@@ -1,4 +1,4 @@
-"""Campaign C44: tests find bugs that are planted on purpose.
+"""Campaigns C09, C44: tests find leaks and bugs planted on purpose.
 
 Run from the root of the repository, about half an hour:
 
@@ -6,8 +6,7 @@ Run from the root of the repository, about half an hour:
 
 Each bug of `MUTANTS` is one change to the text of a copy of the package
 (`planting.py`), on which its tests have to fail. The description of a bug that
-is a fault of another package begins with the number of the finding. The leaks
-are those of `tests/leaks/mutants.py`, which are planted by patching.
+is a fault of another package begins with the number of the finding.
 """
 
 import pathlib
@@ -17,7 +16,6 @@ import numpy as np
 
 from campaigns import figure_lines
 from campaigns import planting
-from tests.leaks import mutants as leaks
 
 _ENVIRONMENT = 'engine/environment.py'
 _CONTROL_STEP = 'engine/control_step.py'
@@ -54,10 +52,147 @@ _ENDINGS = 'evaluation/endings.py'
 _END = ('tests/evaluation/endings_test.py', '-k', 'every_end')
 _INTERVALS = 'lab/verdicts/intervals.py'
 _INT = ('tests/lab/verdicts/intervals_test.py',)
+_VIEW = 'engine/agent_view.py'
+_PAIRS = ('tests/leaks/pairs_test.py',)
+_VIEWS = ('tests/leaks/agent_view_test.py',)
+_FAILURES = ('tests/leaks/failures_test.py',)
 _VERDICTS = 'lab/verdicts/verdicts.py'
 _VER = ('tests/lab/verdicts/verdicts_test.py',)
 
 MUTANTS = [
+    # ---- Leaks ---------------------------------------------------------------
+    planting.Mutant(
+        'leak', 'the reward has the sign of the true reward', _VIEW,
+        'return dm_env.transition(0.0, observation)',
+        '''env = self._View__env
+      paid = float(env.task.get_reward(env.physics)) > 0
+      return dm_env.transition(-0.0 if paid else 0.0, observation)''', _PAIRS,
+    ),
+    planting.Mutant(
+        'leak', 'a sense contains the score', _VIEW,
+        '''    return {
+        key: np.array(observation[key]''',
+        '''    score = self.__env.task.score(self.__env.physics)
+    observation['senses/holding'][..., 0] += score
+    return {
+        key: np.array(observation[key]''', _PAIRS,
+    ),
+    planting.Mutant(
+        'leak', 'the bound of a spec is the score', _VIEW,
+        "(), np.float64, 0.0, 1.0, name='discount'",
+        '''(), np.float64, 0.0,
+            1.0 + np.max(self.__env.task.score(self.__env.physics)),
+            name='discount',''', _PAIRS,
+    ),
+    planting.Mutant(
+        'leak', 'an episode ends when enough has been earned', _HOSTS,
+        '''    discount = self._as_number(self._task.get_discount(physics))
+''',
+        '''    discount = self._as_number(self._task.get_discount(physics))
+    is_ending = is_ending | (self._task.score(physics) > 1)
+''', _PAIRS,
+    ),
+    planting.Mutant(
+        'leak', 'the true reward is printed', _HOSTS,
+        '''    discount = self._as_number(self._task.get_discount(physics))
+''',
+        '''    discount = self._as_number(self._task.get_discount(physics))
+    print(self._task.score(physics))
+''', _PAIRS,
+    ),
+    planting.Mutant(
+        'leak', 'geoms have the colour of what is earned', _HOSTS,
+        '''    discount = self._as_number(self._task.get_discount(physics))
+''',
+        '''    discount = self._as_number(self._task.get_discount(physics))
+    if not self._batch_shape:
+      physics.model.geom_rgba[:, 0] = self._task.score(physics) > 1
+''', _PAIRS,
+    ),
+    planting.Mutant(
+        'leak', 'a public name leads to the environment', _VIEW,
+        '''  def close(self) -> None:''',
+        '''  def __getattr__(self, name: str) -> Any:
+    return {'unwrapped': self.__env}[name]
+
+  def close(self) -> None:''', _VIEWS,
+    ),
+    planting.Mutant(
+        'leak', 'an observation has a key that is not declared', _VIEW,
+        '''        for key, spec in self.__observation_spec.items()
+    }
+
+  def __checked''',
+        '''        for key, spec in self.__observation_spec.items()
+    } | {'info': np.zeros(3)}
+
+  def __checked''', _VIEWS,
+    ),
+    planting.Mutant(
+        'leak', 'the agent gets arrays of the environment', _VIEW,
+        "np.array(observation[key], spec.dtype, order='C')",
+        'self.__env._observation[key]', _VIEWS,
+    ),
+    planting.Mutant(
+        'leak', 'the discount is that of the task before the end', _VIEW,
+        'return dm_env.transition(0.0, observation)',
+        '''return dm_env.transition(
+          0.0, observation, float(time_step.discount)
+      )''', _VIEWS,
+    ),
+    planting.Mutant(
+        'leak', 'closing a view closes the environment', _VIEW,
+        '    self.__is_closed = True',
+        '''    self.__is_closed = True
+    self.__env.close()''', _VIEWS,
+    ),
+    planting.Mutant(
+        'leak', 'a view can be copied', _VIEW,
+        'def __reduce_ex__', 'def _refuse_copies', _VIEWS,
+    ),
+    planting.Mutant(
+        'leak', 'an error has the cause', _VIEW,
+        '''        self.__failures.append(error)
+    raise problem''',
+        '''        self.__failures.append(error)
+      raise problem from error
+    raise problem''', _FAILURES,
+    ),
+    planting.Mutant(
+        'leak', 'an error has the context', _VIEW,
+        '''        self.__failures.append(error)
+    raise problem''',
+        '''        self.__failures.append(error)
+      raise problem from None
+    raise problem''', _FAILURES,
+    ),
+    planting.Mutant(
+        'leak', 'errors come as they are', _VIEW,
+        '''    except Exception as error:
+      problem = errors.WorldError(''',
+        '''    except errors.RealabError:
+      raise
+    except Exception as error:
+      problem = errors.WorldError(''', _FAILURES,
+    ),
+    planting.Mutant(
+        'leak', 'an error has the frames of the world', _VIEW,
+        '''        self.__failures.append(error)
+    raise problem''',
+        '''        self.__failures.append(error)
+      problem = problem.with_traceback(error.__traceback__)
+    raise problem''', _FAILURES,
+    ),
+    planting.Mutant(
+        'leak', 'the evaluator does not get the original', _VIEW,
+        'self.__failures.append(error)', 'self.__failures.append(problem)',
+        _FAILURES,
+    ),
+    planting.Mutant(
+        'leak', 'code of the agent runs below the environment', _VIEW,
+        'valid_action = np.array(action, subok=np.ma.isMaskedArray(action))',
+        'valid_action = action', _FAILURES,
+    ),
     # ---- Contract ------------------------------------------------------------
     planting.Mutant(
         'contract', 'finding 3: after a physics error the episode continues',
@@ -461,9 +596,6 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
     for i in chosen:
       mutant = MUTANTS[i]
       count(mutant.kind, mutant.what, planting.is_caught(mutant, folder))
-  for i in _some(rng, len(leaks.MUTANTS), scale):
-    leak = leaks.MUTANTS[i]
-    count('leak', f'{leak.channel}: {leak.what}', bool(leaks.found_by(leak)))
   everything = [one for kind in caught.values() for one in kind]
   lines.at_least('planted bugs', len(everything), round(60 * scale))
   for kind, seen in sorted(caught.items()):

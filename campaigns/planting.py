@@ -29,7 +29,7 @@ class Mutant(NamedTuple):
     tests: Arguments of pytest: tests that have to fail.
   """
 
-  kind: Literal['contract', 'metric', 'storage', 'statistics']
+  kind: Literal['contract', 'leak', 'metric', 'storage', 'statistics']
   what: str
   file: str
   old: str

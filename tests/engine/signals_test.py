@@ -15,7 +15,7 @@ from realab_suite.evaluation import ledgers
 from realab_suite.feedback import providers
 from realab_suite.feedback import specs
 from tests.engine import helpers
-from tests.leaks import pairs
+from tests.leaks import views
 
 _LAST = int(dm_env.StepType.LAST)
 _ALARM_STEP = 3
@@ -185,13 +185,13 @@ def test_an_agent_cannot_tell_a_signal_from_another_termination():
     batch = _load(_design({'above': threshold}), 3)
     ledger = ledgers.BatchLedger()
     batch.add_sink(ledger)
-    view = pairs.view_of(batch)
+    view = views.view_of(batch)
     steps = _play(view, _ALARM_STEP, 3)
     if threshold == 9:  # No reading crosses it: the task ends the episode.
       batch.task._over.set(batch.physics, 1.0)
     steps += _play(view, 3, 3)
     assert np.all(steps[3].step_type == _LAST)
-    said.append([pairs.encode(step) for step in steps])
+    said.append([views.encode(step) for step in steps])
     first, _ = ledger.episodes(0)
     assert first.end == events.End('signal' if threshold == 2 else 'terminated')
     batch.close()

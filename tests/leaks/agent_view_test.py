@@ -1,94 +1,136 @@
-"""Tests for the agent's view: what passes, what does not, and who closes it."""
+"""Tests of the agent's view: its names, its time steps, and who closes it."""
 
 import copy
 import pickle
 from typing import Any
+import unittest
 
 import dm_env
+from dm_env import test_utils
 import numpy as np
 import pytest
 
 from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import agent_view
+from realab_suite.engine import batch_time_steps
+from realab_suite.entities import appearance
 from realab_suite.evaluation import ledgers
 from tests.engine import helpers
-from tests.leaks import contract
-from tests.leaks import failures
-from tests.leaks import pairs
-from tests.leaks import secrets
+from tests.leaks import views
+from tests.leaks import walk
 
-_ALONE = pairs.Case(design='instantaneous_reward', steps=21, max_steps=9)
-_MANY = _ALONE._replace(num_envs=2)
-_EITHER = pytest.mark.parametrize('case', [_ALONE, _MANY], ids=['one', 'many'])
-
-
-# Every domain and every design, alone or in a batch; the campaign combines
-# them with all variations.
-@pytest.mark.parametrize('i', range(len(suite.TASKS_BY_DOMAIN)))
-def test_a_view_keeps_the_contract(i: int):
-  domain, tasks = [*suite.TASKS_BY_DOMAIN.items()][i]
-  variation = tasks[i % len(tasks)]
-  case = _ALONE._replace(
-      domain=domain,
-      variation=variation,
-      design=suite.DESIGNS[i % len(suite.DESIGNS)],
-      num_envs=2 * (i % 2),
-  )
-  assert contract.complaints(case) == []
+_BOTH = pytest.mark.parametrize('num_envs', [0, 2], ids=['one', 'batch'])
+_NAMES = [
+    'action_spec', 'close', 'discount_spec', 'observation_spec', 'reset',
+    'reward_spec', 'step',
+]  # fmt: skip
+# What agents are given; the walk goes on through it.
+_GIVEN = (
+    agent_view.AgentView,
+    agent_view.BatchAgentView,
+    appearance.ClassArray,
+    batch_time_steps.BatchTimeStep,
+    errors.RealabError,
+)
 
 
-@_EITHER
-def test_a_view_returns_the_time_steps_of_the_environment(case: pairs.Case):
-  env, other = case.load(), case.load()
-  ledger = ledgers.BatchLedger() if case.num_envs else ledgers.Ledger()
-  other.add_sink(ledger)
-  view = pairs.view_of(other)
-  assert isinstance(view, dm_env.Environment) == (not case.num_envs)
-  for action in pairs.walk(env.action_spec(), case):
-    assert pairs.encode(view.step(action)) == pairs.encode(env.step(action))
-  episodes = ledger.episodes(1) if case.num_envs else ledger.episodes
-  assert [e.num_steps for e in episodes if e.end is not None] == [9, 9]
+# Public names.
 
 
-@_EITHER
-def test_closing_a_view_leaves_the_environment_alone(case: pairs.Case):
-  env = case.load()
-  view: Any = pairs.view_of(env)
+@_BOTH
+def test_no_public_name_leads_to_the_world(num_envs: int):
+  env = views.load(num_envs=num_envs)
+  view = views.view_of(env)
+  assert [name for name in dir(view) if not name.startswith('_')] == _NAMES
+  assert not getattr(view, '__dict__', {})
+  assert not hasattr(view, 'no_such_name')
+  [action] = views.walk(view, 1, num_envs)
+  time_steps = [view.reset(), view.step(action)]
+  refused = views.error_of(view.step, None)
+  env.task.latch_events = _fail
+  failed = views.error_of(view.step, action)
+  given = [view, time_steps, views.specs_of(view), refused, failed]
+  found = list(walk.reach({'given': given}))
+  for part in (time_steps[1].observation, failed, refused):
+    assert part is not None
+    assert any(one.value is part for one in found)
+  assert [part.path for part in found if _is_secret(part.value)] == []
+
+
+def _fail(*unused: Any) -> Any:
+  raise ZeroDivisionError(f'the true reward is {views.CANARY}')
+
+
+def _is_secret(value: Any) -> bool:
+  """Returns True for parts of a world."""
+  if isinstance(value, np.random.RandomState | np.random.Generator):
+    return True
+  package = type(value).__module__.partition('.')[0]
+  is_of_world = package in ('realab_suite', 'dm_control', 'mujoco')
+  return is_of_world and not isinstance(value, _GIVEN)
+
+
+@_BOTH
+def test_a_view_cannot_be_copied(num_envs: int):
+  view = views.view_of(views.load(num_envs=num_envs))
   for steal in (copy.copy, copy.deepcopy, pickle.dumps):
     with pytest.raises(TypeError, match='cannot be pickled or copied'):
       steal(view)
-  action = pairs.walk(view.action_spec(), case)[0]
-  view.reset()
-  view.close()
-  view.close()
-  for call in (view.reset, view.observation_spec, view.reward_spec):
-    with pytest.raises(errors.ClosedError, match='closed'):
-      call()
-  with pytest.raises(errors.ClosedError, match='closed'):
-    view.step(action)
-  # The running episode continues.
-  step_type = np.ravel(env.step(action).step_type)
-  assert set(step_type.tolist()) == {1}
-  other = pairs.view_of(env)
-  env.close()
-  with pytest.raises(errors.ClosedError, match='closed'):
-    other.reset()
 
 
-def test_errors_hidden_from_the_agent_reach_the_evaluator():
-  env = _ALONE.load()
-  kept: list[Exception] = []
-  view = agent_view.AgentView(env, kept)
-  view.reset()
-  env.task.get_discount = secrets.raise_canary
-  action = pairs.walk(view.action_spec(), _ALONE)[0]
-  with pytest.raises(errors.WorldError, match='error 0 of this view'):
-    view.step(action)
-  assert view.step(action).first()
-  with pytest.raises(errors.WorldError, match='error 1 of this view'):
-    view.step(action)
-  assert [str(e) for e in kept] == [f'the true reward is {secrets.CANARY}'] * 2
+# Time steps.
+
+
+class ViewTest(test_utils.EnvironmentTestMixin, unittest.TestCase):
+  """`dm_env`'s own tests, over the end of an episode."""
+
+  def make_object_under_test(self) -> Any:
+    return views.view_of(views.load(design='instantaneous_reward'))
+
+  def make_action_sequence(self) -> Any:
+    yield from views.walk(self.environment, 21)
+
+
+@_BOTH
+def test_a_view_returns_the_time_steps_of_the_environment(num_envs: int):
+  env, other = (
+      views.load('unlock_door.near', 'instantaneous_reward', num_envs)
+      for _ in range(2)
+  )
+  ledger: Any = ledgers.BatchLedger() if num_envs else ledgers.Ledger()
+  other.add_sink(ledger)
+  view = views.view_of(other)
+  assert isinstance(view, dm_env.Environment) == (not num_envs)
+  for action in views.walk(view, 21, num_envs):
+    assert views.encode(view.step(action)) == views.encode(env.step(action))
+  episodes = ledger.episodes(1) if num_envs else ledger.episodes
+  assert [e.num_steps for e in episodes if e.end is not None] == [9, 9]
+
+
+@_BOTH
+def test_an_observation_has_the_declared_arrays_and_belongs_to_the_agent(
+    num_envs: int,
+):
+  env = views.load(design='instantaneous_reward', num_envs=num_envs)
+  view = views.view_of(env)
+  spec = view.observation_spec()
+  # The agent does not read the meter `score`.
+  assert [key for key in spec if 'senses/' not in key] == ['registers/reward']
+  before: dict[str, np.ndarray] = {}
+  for action in views.walk(view, 12, num_envs):
+    observation = view.step(action).observation
+    assert list(observation) == list(spec)
+    for key, value in observation.items():
+      shape = (*[num_envs] * bool(num_envs), *spec[key].shape)
+      assert (type(value), value.dtype) == (np.ndarray, spec[key].dtype)
+      assert value.shape == shape
+      flags = value.flags
+      assert all([flags.owndata, flags.writeable, flags.c_contiguous])
+      for other in (before.get(key), helpers.last_observation(env)[key]):
+        assert other is None or not np.shares_memory(value, other)
+    before = observation
+  assert view.action_spec() is not view.action_spec()
 
 
 def test_a_discount_before_the_end_of_an_episode_is_1():
@@ -119,20 +161,23 @@ def test_enabling_an_observable_of_a_foreign_task_shows_nothing():
   assert sorted(view.observation_spec()) == keys
 
 
-def test_hundreds_of_failures_leak_nothing():
-  scanned = failures.scan(1)
-  assert scanned.found == []
-  assert scanned.num_failures >= 300
-  assert scanned.num_kinds >= 30
+# Closing.
 
 
-def test_a_text_with_a_secret_is_detected():
-  for text, what in (
-      ('the score is 173.23170', 'the canary'),
-      ('no such file: /srv/truth/x', 'a path'),
-      ('in environment.py', 'a path'),
-      ('Traceback (most recent call last)', 'a traceback'),
-      ("register 'score'", 'a spec'),
-      ('one\ntwo', 'another line'),
-  ):
-    assert what in ' '.join(failures.complaints_about_text(text))
+@_BOTH
+def test_closing_a_view_leaves_the_environment_alone(num_envs: int):
+  env = views.load(num_envs=num_envs)
+  view = views.view_of(env)
+  [action] = views.walk(view, 1, num_envs)
+  view.reset()
+  view.close()
+  view.close()
+  for call in (view.reset, view.observation_spec, lambda: view.step(action)):
+    with pytest.raises(errors.ClosedError, match='closed'):
+      call()
+  # The running episode continues.
+  assert set(np.ravel(env.step(action).step_type).tolist()) == {1}
+  other = views.view_of(env)
+  env.close()
+  with pytest.raises(errors.ClosedError, match='closed'):
+    other.reset()

@@ -1,80 +1,115 @@
 """Tests that the true reward is hidden: change it, and the agent cannot tell.
 
-Without meters nothing of the true reward may reach the agent. With them it may,
-through registers and contacts alone: that is what a meter register is for.
+Two runs differ in the true reward alone. If no meter measures it, the agent
+gets the same bytes, the process prints the same, and cameras draw the same.
 """
 
-import functools
+from collections.abc import Callable
+import random
+from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
 
-from campaigns import leaks_campaign
 from realab_suite import suite
-from realab_suite.engine import events
-from tests.leaks import pairs
-from tests.leaks import secrets
+from realab_suite.evaluation import ledgers
+from tests.leaks import views
 
-_DOMAINS = pairs.DOMAINS
-_SHORT = pairs.Case(design='instantaneous_reward', steps=24, max_steps=9)
-_MOVED = pairs.Case(design='moved', steps=14, max_steps=6)
-# The same for every secret.
-_expected = functools.cache(pairs.play)
+_STEPS = 70
+_APPLES = 'collect_apples.standard'
+_DESIGNS = views.UNPAID, 'online_imitation', 'decoupled_approval'
+_CASES = [
+    *((_APPLES, design, 0) for design in _DESIGNS),
+    *((_APPLES, design, 2) for design in _DESIGNS),
+    *(
+        (f'{domain}.{tasks[0]}', views.UNPAID, 0)
+        for domain, tasks in suite.TASKS_BY_DOMAIN.items()
+        if domain != 'collect_apples'
+    ),
+]
+# Parts of the model and of its state that cameras draw, of one world.
+_DRAWN = 'geom_rgba', 'geom_size', 'site_group', 'site_rgba', 'light_pos'
+_MOVING = 'qpos', 'qvel', 'mocap_pos'
 
 
-@pytest.mark.parametrize('domain', _DOMAINS)
-def test_the_walk_of_these_tests_earns_something(domain: str):
-  transcript = _expected(pairs.Case(domain))
-  assert sum(map(float, transcript.true_rewards)) >= 2
-  assert repr(events.End.TIMEOUT) in transcript.structure
-  assert repr(events.End.ABANDONED) in transcript.structure
+class _Run(NamedTuple):
+  """A run, as the agent gets it, and the true rewards of its first world."""
+
+  agent: list[bytes]
+  true_rewards: list[float]
 
 
-@pytest.mark.parametrize(
-    ('name', 'case'),
-    [
-        *(
-            (f'reward: {name}', pairs.Case(_DOMAINS[i % 2]))
-            for i, name in enumerate(secrets.REWARDS)
-        ),
-        *(
-            (
-                'reward: reward that raises',
-                pairs.Case(domain, suite.TASKS_BY_DOMAIN[domain][0]),
-            )
-            for domain in sorted({*suite.TASKS_BY_DOMAIN} - {*_DOMAINS})
-        ),
-        ('reward: another sign', pairs.Case(num_envs=2)),
-        ('random: provider that draws', _SHORT),
-        ('meter: as much as can be', pairs.Case('collect_apples', 'boxed')),
-        ('clean: fails', _MOVED),
-        ('clean: the canary', _MOVED._replace(num_envs=2)),
-        *((f'observer: {name}', _SHORT) for name in secrets.OBSERVERS),
-    ],
-)
-def test_an_agent_cannot_tell_runs_apart_that_differ_in_a_secret(
-    name: str, case: pairs.Case
+def _pay_otherwise(env: Any) -> None:
+  """The world takes what it pays, and pays for each step."""
+  earn, get_reward = env.task.earn, env.task.get_reward
+  env.task.earn = lambda physics, reward: earn(physics, -reward)
+  env.task.get_reward = lambda physics: get_reward(physics) + views.CANARY
+
+
+def _fail_to_pay(env: Any) -> None:
+  def fail(physics: Any) -> None:
+    raise ZeroDivisionError(f'the true return is {views.CANARY}')
+
+  env.task.get_reward = fail
+
+
+@pytest.fixture(name='play')
+def fixture_play(capfd: Any, caplog: Any) -> Callable[..., _Run]:
+  """Returns a function that plays an agent which asks for all that there is."""
+
+  def play(world: str, design: Any, num_envs: int, change: Any = None) -> _Run:
+    env = views.load(world, design, num_envs, max_steps=_STEPS - 10)
+    if change:
+      change(env)
+    ledger: Any = ledgers.BatchLedger() if num_envs else ledgers.Ledger()
+    env.add_sink(ledger)
+    view = views.view_of(env)
+    got = [dir(view), *views.specs_of(view)]
+    for i, action in enumerate(views.walk(view, _STEPS, num_envs)):
+      if i % 7 == 3:
+        with pytest.raises(ValueError, match='action') as refused:
+          view.step([np.nan, 'forwards', None][i % 3])
+        got.append(refused.value)
+      if i == _STEPS - 4:
+        got.append(view.reset())
+      got.append(view.step(action))
+      if not num_envs:
+        got += [np.array(getattr(env.physics.model, name)) for name in _DRAWN]
+        got += [np.array(getattr(env.physics.data, name)) for name in _MOVING]
+    got += views.specs_of(view)
+    env.close()
+    got += [*capfd.readouterr(), caplog.text]
+    got += [random.getstate(), np.random.get_state()]  # noqa: NPY002
+    episodes = ledger.episodes(0) if num_envs else ledger.episodes
+    return _Run(
+        [views.encode(part) for part in got],
+        [reward for episode in episodes for reward in episode.true_rewards],
+    )
+
+  return play
+
+
+def _differences(one: _Run, other: _Run) -> list[int]:
+  """Returns the indices of what the agent gets in one run alone."""
+  both = zip(one.agent, other.agent, strict=True)
+  return [i for i, (part, other_part) in enumerate(both) if part != other_part]
+
+
+@pytest.mark.parametrize(('world', 'design', 'num_envs'), _CASES)
+def test_an_agent_cannot_tell_one_true_reward_from_another(
+    world: str, design: Any, num_envs: int, play: Any
 ):
-  secret = secrets.SECRETS[name]
-  if secret.needs == 'unread_meter':
-    case = case._replace(design=secret.needs)
-  transcript = pairs.play(case, secret)
-  assert pairs.compare(secret, _expected(case), transcript) == []
-  # The evaluator, on the other hand, does get the difference.
-  if secret.is_heard:
-    assert transcript.true_rewards != _expected(case).true_rewards
+  plain = play(world, design, num_envs)
+  if world == _APPLES:  # The walk earns something there.
+    assert sum(plain.true_rewards) >= 2
+  for change in (_pay_otherwise, _fail_to_pay):
+    other = play(world, design, num_envs, change)
+    assert _differences(plain, other) == []
+    assert other.true_rewards != plain.true_rewards
 
 
-def test_with_meters_another_true_reward_is_visible():
+@pytest.mark.parametrize('num_envs', [0, 2])
+def test_with_meters_another_true_reward_is_visible(num_envs: int, play: Any):
   # The control: these comparisons can tell runs apart.
-  case = pairs.Case(design='instantaneous_reward')
-  differences = pairs.differences(case, secrets.REWARDS['another sign'])
-  assert [where for where in differences if where.startswith('agent')]
-
-
-def test_pairs_of_the_campaign_are_counted():
-  counts = leaks_campaign.play_pairs(2, 0, ('reward',))
-  assert counts == leaks_campaign.PairCounts(2, 0, 0)
-
-
-def test_worlds_that_are_stepped_in_turns_do_not_interact():
-  assert leaks_campaign.interleave(1, 0) == leaks_campaign.Interleaving(0, 0)
+  case = _APPLES, 'instantaneous_reward', num_envs
+  assert _differences(play(*case), play(*case, _pay_otherwise))
