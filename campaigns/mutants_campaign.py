@@ -113,7 +113,9 @@ MUTANTS = [
         'leak', 'a public name leads to the environment', _VIEW,
         '''  def close(self) -> None:''',
         '''  def __getattr__(self, name: str) -> Any:
-    return {'unwrapped': self.__env}[name]
+    if name == 'unwrapped':
+      return self.__env
+    raise AttributeError(name)
 
   def close(self) -> None:''', _VIEWS,
     ),
