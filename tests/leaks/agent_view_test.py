@@ -35,9 +35,6 @@ _GIVEN = (
 )
 
 
-# Public names.
-
-
 @_BOTH
 def test_no_public_name_leads_to_the_world(num_envs: int):
   env = views.load(num_envs=num_envs)
@@ -77,9 +74,6 @@ def test_a_view_cannot_be_copied(num_envs: int):
   for steal in (copy.copy, copy.deepcopy, pickle.dumps):
     with pytest.raises(TypeError, match='cannot be pickled or copied'):
       steal(view)
-
-
-# Time steps.
 
 
 class ViewTest(test_utils.EnvironmentTestMixin, unittest.TestCase):
@@ -159,9 +153,6 @@ def test_enabling_an_observable_of_a_foreign_task_shows_nothing():
   for _ in range(8):
     assert sorted(view.step([0.1]).observation) == keys
   assert sorted(view.observation_spec()) == keys
-
-
-# Closing.
 
 
 @_BOTH

@@ -23,11 +23,8 @@ def reach(roots: dict[str, Any], depth: int = 8) -> Iterator[Found]:
   """Yields the objects that can be reached, nearest first.
 
   Ways are public names, elements of containers, what methods are bound to,
-  closures, and what exceptions hold on to; never modules and classes.
-
-  Args:
-    roots: The objects at which the walk begins, by name.
-    depth: Number of steps.
+  closures, and what exceptions hold on to; never modules and classes. The walk
+  begins at `roots`, objects by name, and takes `depth` steps.
   """
   todo = [Found(name, value) for name, value in roots.items()]
   seen: dict[int, Any] = {}  # What has been seen has to stay alive.
