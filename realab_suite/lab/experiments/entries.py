@@ -167,9 +167,10 @@ def _experiment(
 
 @contextlib.contextmanager
 def _batch(job: jobs.Job) -> Iterator[Any]:
-  """Opens one world of a job, for its specs."""
+  """Opens the worlds of a learner, for their specs and their number."""
+  experiment = job.experiment
   with contextlib.closing(
-      job.experiment.world.load_batch(job.design, 1, 0)
+      experiment.world.load_batch(job.design, experiment.training.num_envs, 0)
   ) as batch:
     yield batch
 

@@ -25,7 +25,8 @@ _BUDGET = budgets.Budget(200, 1, num_seeds=1, episodes=3)
 _RUN = {
     'design': 'instantaneous_reward',
     'overrides': ['dof=planar', 'action_set={name: dmlab_like, version: 1}'],
-    'learner': {'hidden': [8]},
+    # Its state has a value for each world.
+    'learner': {'hidden': [8], 'defence': {'kind': 'cap', 'high': 5}},
     'twin': True,
 }
 
