@@ -79,20 +79,13 @@ class Documents(Generic[_Spec]):
       self,
       source: Source | _Spec,
       overrides: Sequence[str] = (),
-      *,
-      is_confined: bool = False,
   ) -> _Spec:
     """Loads and validates a spec.
-
-    Paths in a file must be within the working directory, unless an override
-    names them.
 
     Args:
       source: Name of a file of the package, path of a YAML file, mapping, or
         spec.
       overrides: Dotted overrides; see `loading.apply_overrides`.
-      is_confined: True if paths in `overrides` and `source` must also be within
-        the working directory.
 
     Raises:
       SpecError: If the source or an override is wrong; the message is one line
@@ -104,22 +97,12 @@ class Documents(Generic[_Spec]):
           f'overrides: {messages.quote(overrides)}; must be a list of'
           " strings, such as ['channel=secure']"
       )
-    if isinstance(source, self._model) and not overrides and not is_confined:
+    if isinstance(source, self._model) and not overrides:
       return source
-    where, data = self._read(source, is_confined)
-    is_file = isinstance(source, str | os.PathLike)
-    return validation.validate(
-        self._model,
-        data,
-        where,
-        overrides,
-        is_confined=is_file or is_confined,
-        are_overrides_free=not is_confined,
-    )
+    where, data = self._read(source)
+    return validation.validate(self._model, data, where, overrides)
 
-  def _read(
-      self, source: Source | _Spec, is_confined: bool
-  ) -> tuple[str, dict[str, Any]]:
+  def _read(self, source: Source | _Spec) -> tuple[str, dict[str, Any]]:
     """Returns the name of a source for messages, and its data."""
     what = self._what
     if isinstance(source, self._model):
@@ -142,10 +125,5 @@ class Documents(Generic[_Spec]):
       raise errors.UnknownNameError(
           f'{what} {messages.quote(source)} is neither a file nor one of'
           f' {list(self.names)}{messages.did_you_mean(source, self.names)}'
-      )
-    if is_confined and not loading.is_inside(where):
-      raise errors.SpecError(
-          f'{what} {messages.quote(where)} is outside the working directory;'
-          f' allowed in a file are paths within it and {list(self.names)}'
       )
     return where, loading.read_mapping(where)

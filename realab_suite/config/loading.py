@@ -1,10 +1,10 @@
 """Reading of untrusted YAML files and mappings, and overrides of their values.
 
 A description is a YAML file, or a mapping of the same shape. The YAML library
-constructs no objects: it only splits the text into events, and this module
-builds mappings, lists, strings, numbers, booleans and nulls from them. (The
-library's own composer overflows the stack of the process on a text of many
-brackets.) Anchors, aliases and tags are refused.
+builds mappings, lists, strings, numbers, booleans and nulls, and no objects.
+Before, its events are checked, because it builds what is nested by recursion
+and would overflow the stack on a text of many brackets. Anchors, aliases and
+tags are refused.
 
 Unquoted `true`, `false`, `null`, `~`, plain decimal integers and decimal floats
 (including `1e3`) have their usual meaning. Other words that YAML 1.1 converts,
@@ -18,7 +18,7 @@ import math
 import os
 import re
 import sys
-from typing import Any
+from typing import Any, ClassVar, final
 import unicodedata
 
 import yaml
@@ -38,25 +38,24 @@ _FORBIDDEN_CATEGORIES = frozenset({'Cc', 'Cf', 'Cs', 'Zl', 'Zp'})
 # Not characters of YAML.
 _NONCHARACTERS = '\ufffe\uffff'
 
-_WORDS = {
-    **dict.fromkeys(('', '~', 'null', 'Null', 'NULL')),
-    **dict.fromkeys(('true', 'True', 'TRUE'), True),
-    **dict.fromkeys(('false', 'False', 'FALSE'), False),
-}
-_INT = re.compile(r'[-+]?(0|[1-9][0-9]*)')
-_FLOAT = re.compile(
-    r'[-+]?(\.[0-9]+|[0-9]+\.[0-9]*|[0-9]+(?=[eE]))([eE][-+]?[0-9]+)?'
+_TAG = 'tag:yaml.org,2002:'
+_AMBIGUOUS = 'ambiguous'
+# Patterns of unquoted words. Others are ambiguous if YAML 1.1 converts them.
+_WORDS = tuple(
+    (tag, re.compile(rf'(?:{pattern})\Z'))
+    for tag, pattern in (
+        (f'{_TAG}null', '~|null|Null|NULL|'),
+        (f'{_TAG}bool', 'true|True|TRUE|false|False|FALSE'),
+        (f'{_TAG}int', r'[-+]?(0|[1-9][0-9]*)'),
+        (
+            f'{_TAG}float',
+            r'[-+]?(\.[0-9]+|[0-9]+\.[0-9]*|[0-9]+(?=[eE]))([eE][-+]?[0-9]+)?'
+            r'|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)',
+        ),
+        # Often meant as booleans, and octal numbers of YAML 1.2.
+        (_AMBIGUOUS, r'(?i:yes|no|on|off)|[-+]?0[oO][0-7]+'),
+    )
 )
-# They are numbers of YAML, so that a message names their keys.
-_NOT_FINITE = re.compile(r'[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)')
-# Words that are often meant as booleans, and octal numbers of YAML 1.2.
-_AMBIGUOUS = re.compile(r'(?i:yes|no|on|off)|[-+]?0[oO][0-7]+')
-# Paths that other programs or systems resolve outside of a directory.
-_LEADS_ELSEWHERE = re.compile(
-    r'~|[A-Za-z]:|[A-Za-z][\w+.-]*://|.*\\', re.DOTALL
-)
-_YAML_1_1 = yaml.resolver.Resolver()
-_TEXT_TAG = 'tag:yaml.org,2002:str'
 
 
 def read_mapping(
@@ -137,21 +136,6 @@ def parse_yaml(text: str | bytes, where: str) -> dict[str, Any]:
   )
 
 
-def is_inside(path: str) -> bool:
-  """Returns True if a path is within the working directory, links followed.
-
-  Files may name only such paths, because their author may be untrusted. URLs
-  and paths with a leading `~`, a drive or a backslash are always outside.
-  """
-  if _LEADS_ELSEWHERE.match(path):
-    return False
-  root = os.path.realpath(os.curdir)
-  try:
-    return os.path.commonpath([root, os.path.realpath(path)]) == root
-  except ValueError:  # The text is not a valid path.
-    return False
-
-
 def apply_overrides(
     data: Mapping[str, Any], overrides: Sequence[str]
 ) -> dict[str, Any]:
@@ -220,13 +204,6 @@ def override_name(override: object) -> str:
   return f'override {messages.quote(override)}'
 
 
-def texts_in_overrides(overrides: Sequence[str]) -> frozenset[str]:
-  """Returns the texts in the values of overrides, at any depth."""
-  return frozenset(
-      text for override in overrides for text in texts_in(_split(override)[1])
-  )
-
-
 def texts_in(value: Any) -> Iterator[str]:
   """Yields every text in nested lists and mappings, keys included."""
   if isinstance(value, str):
@@ -277,12 +254,9 @@ def _documents(text: str | bytes, where: str) -> list[Any]:
     for number, line in enumerate(text.split('\n'), 1):
       if not line.isprintable() and (problem := _forbidden_character(line)):
         raise messages.Location(where, line=number).error(problem)
-    events = yaml.parse(text, yaml.CSafeLoader)
-    return [
-        _plain(_value(events, next(events)), where)
-        for event in events
-        if isinstance(event, yaml.DocumentStartEvent)
-    ]
+    _check_events(text)
+    documents = yaml.load_all(text, _Loader)  # noqa: TID251
+    return [_plain(document, where) for document in documents]
   except yaml.MarkedYAMLError as error:
     mark = error.problem_mark
     at = messages.Location(where, line=None if mark is None else mark.line + 1)
@@ -303,74 +277,86 @@ def _decoded(content: bytes, where: str) -> str:
     ) from None
 
 
-def _value(events: Iterator[Any], event: Any, depth: int = 0) -> Any:
-  """Returns the value that begins with an event.
-
-  Args:
-    events: The events that follow.
-    event: First event of the value.
-    depth: Number of collections around the value.
+def _check_events(text: str) -> None:
+  """Checks what the library must not build.
 
   Raises:
-    YAMLError: If the text is not allowed by this module's docstring.
+    YAMLError: If the text is not YAML, is nested too deeply, or has anchors,
+      aliases or tags.
   """
-  if event.anchor is not None:
-    raise _refusal(event, 'anchors and aliases are not allowed')
-  if event.tag is not None:
-    raise _refusal(event, f'tag {messages.quote(event.tag)} not allowed')
-  if isinstance(event, yaml.ScalarEvent):
-    is_plain = event.implicit[0]
-    return _resolved(event) if is_plain else event.value
-  if depth == _MAX_DEPTH:
-    raise _refusal(event, _TOO_DEEP)
-  if isinstance(event, yaml.SequenceStartEvent):
-    values = []
-    while not isinstance(event := next(events), yaml.SequenceEndEvent):
-      values.append(_value(events, event, depth + 1))
-    return values
+  depth = 0
+  for event in yaml.parse(text, _Loader):
+    depth += isinstance(event, yaml.CollectionStartEvent)
+    depth -= isinstance(event, yaml.CollectionEndEvent)
+    if depth > _MAX_DEPTH:
+      raise _refusal(event, _TOO_DEEP)
+    if getattr(event, 'anchor', None):
+      raise _refusal(event, 'anchors and aliases are not allowed')
+    if tag := getattr(event, 'tag', None):
+      raise _refusal(event, f'tag {messages.quote(tag)} not allowed')
+
+
+def _mapping(loader: Any, node: yaml.MappingNode) -> dict[str, Any]:
+  """Returns the value of a mapping, whose keys are texts and differ."""
   mapping: dict[str, Any] = {}
   lines: dict[str, int] = {}
-  while not isinstance(event := next(events), yaml.MappingEndEvent):
-    key = _value(events, event, depth + 1)
+  for key_node, value_node in node.value:
+    key = loader.construct_object(key_node, deep=True)
     if not isinstance(key, str):
-      raise _refusal(event, _wrong_key(key))
-    line = event.start_mark.line + 1
+      raise _refusal(key_node, _wrong_key(key))
+    line = key_node.start_mark.line + 1
     if key in mapping:
       both = f'lines {lines[key]} and {line}'
-      raise _refusal(event, f'duplicate key {messages.quote(key)} ({both})')
+      raise _refusal(key_node, f'duplicate key {messages.quote(key)} ({both})')
     lines[key] = line
-    mapping[key] = _value(events, next(events), depth + 1)
+    mapping[key] = loader.construct_object(value_node, deep=True)
   return mapping
 
 
-def _refusal(event: Any, problem: str) -> yaml.MarkedYAMLError:
-  return yaml.MarkedYAMLError(problem=problem, problem_mark=event.start_mark)
+def _integer(loader: Any, node: yaml.ScalarNode) -> int:
+  del loader
+  # Python cannot convert thousands of digits. Fewer are out of range as well.
+  return int(node.value[:100])
+
+
+def _refuse_word(loader: Any, node: yaml.ScalarNode) -> None:
+  del loader
+  raise _refusal(
+      node,
+      f'{messages.quote(node.value)} is ambiguous: quote it if it is text, or'
+      ' write true, false or a plain decimal number',
+  )
+
+
+# Some builds of the library lack the faster loader.
+_LibraryLoader: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
+
+
+@final
+class _Loader(_LibraryLoader):
+  """Builds plain values; unquoted words have the meaning of YAML 1.2."""
+
+  yaml_implicit_resolvers: ClassVar[dict[str, Any]] = {
+      first: [*_WORDS, *((_AMBIGUOUS, pattern) for _, pattern in patterns)]
+      for first, patterns in (
+          yaml.resolver.Resolver.yaml_implicit_resolvers.items()
+      )
+  }
+  yaml_constructors: ClassVar[dict[Any, Any]] = {
+      **yaml.SafeLoader.yaml_constructors,
+      f'{_TAG}map': _mapping,
+      f'{_TAG}int': _integer,
+      _AMBIGUOUS: _refuse_word,
+  }
+
+
+def _refusal(place: Any, problem: str) -> yaml.MarkedYAMLError:
+  """Returns the error of an event or a node."""
+  return yaml.MarkedYAMLError(problem=problem, problem_mark=place.start_mark)
 
 
 def _wrong_key(key: object) -> str:
   return f'keys must be strings, got {messages.quote(key)} (quote it)'
-
-
-def _resolved(event: yaml.ScalarEvent) -> bool | int | float | str | None:
-  """Returns the value of an unquoted scalar."""
-  text = event.value
-  if text in _WORDS:
-    return _WORDS[text]
-  if _INT.fullmatch(text):
-    # Python cannot convert thousands of digits. Fewer are out of range as well.
-    return int(text[:100])
-  if _FLOAT.fullmatch(text):
-    return float(text)
-  if _NOT_FINITE.fullmatch(text):
-    return float(text.replace('.', ''))
-  tag = _YAML_1_1.resolve(yaml.ScalarNode, text, (True, False))
-  if tag != _TEXT_TAG or _AMBIGUOUS.fullmatch(text):
-    raise _refusal(
-        event,
-        f'{messages.quote(text)} is ambiguous: quote it if it is text, or write'
-        ' true, false or a plain decimal number',
-    )
-  return text
 
 
 def _plain(value: Any, where: str, path: tuple[str | int, ...] = ()) -> Any:

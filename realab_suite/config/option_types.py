@@ -14,7 +14,6 @@ import dataclasses
 import functools
 import inspect
 import json
-import re
 from typing import Annotated, Any, final
 
 import pydantic
@@ -23,16 +22,9 @@ from pydantic_core import core_schema
 from realab_suite.config import registry
 from realab_suite.config import validation
 
-FilePath = Annotated[str, pydantic.AfterValidator(validation.check_path)]
-"""Path of a file.
+FilePath = str
+"""Path of a file. A design names it as text, and the class opens it."""
 
-`validation` refuses paths in a file that lead out of the working directory, at
-any depth of models and options, before any of them is opened.
-"""
-
-# Classes of paths in the text of a schema.
-# In Python 3.13, that of paths is `pathlib._local`.
-_PATH = re.compile(r"<class '(?:pathlib|os)(?:\.\w+)+'>")
 _BY_NAME = (
     inspect.Parameter.POSITIONAL_OR_KEYWORD,
     inspect.Parameter.KEYWORD_ONLY,
@@ -81,9 +73,9 @@ class ModelIn:
 
   def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
     del source, handler
-    return core_schema.with_info_plain_validator_function(self._validated)
+    return core_schema.no_info_plain_validator_function(self._validated)
 
-  def _validated(self, value: Any, info: pydantic.ValidationInfo) -> Any:
+  def _validated(self, value: Any) -> Any:
     if isinstance(value, pydantic.BaseModel):
       return value
     if self._name is not None:
@@ -92,7 +84,7 @@ class ModelIn:
       if not isinstance(value, Mapping):
         raise ValueError('must be a name, or a mapping with a kind')
     kind = self._kind.model_validate(value).kind
-    return self._models.get(kind).model_validate(value, context=info.context)
+    return self._models.get(kind).model_validate(value)
 
 
 @final
@@ -148,7 +140,7 @@ class OptionsOf:
     # never becomes a number.
     text = json.dumps(value)
     try:
-      options.validate_json(text, strict=True, context=info.context)
+      options.validate_json(text, strict=True)
     except pydantic.ValidationError as error:
       # Classes check options that no file can contain, such as arrays.
       if {one['type'] for one in error.errors()} != {'needs_python_object'}:
@@ -174,7 +166,7 @@ def _options_of(
 
   Raises:
     NameError: If an annotation is a string that names no type.
-    TypeError: If `factory` has no signature, or a path has the wrong type.
+    TypeError: If `factory` has no signature.
   """
   taken = {
       'self',
@@ -206,8 +198,6 @@ def _options_of(
           namespace={'__pydantic_config__': config},
       )
   )
-  if path := _PATH.search(repr(options.core_schema)):
-    raise TypeError(f'{path[0]}; allowed for a path is FilePath')
   return list(fields), options
 
 

@@ -170,9 +170,6 @@ def validate(
     data: Mapping[str, Any],
     where: str,
     overrides: Sequence[str] = (),
-    *,
-    is_confined: bool = False,
-    are_overrides_free: bool = False,
 ) -> _Model:
   """Returns the model that the data describes.
 
@@ -183,21 +180,14 @@ def validate(
     where: Name of the data in error messages.
     overrides: Overrides of the data; see `loading.apply_overrides`. If one of
       them makes valid data invalid, the message names it in place of the data.
-    is_confined: True if paths must be within the working directory.
-    are_overrides_free: True if paths that overrides name are exempt from that.
 
   Raises:
     SpecError: If the data does not fit. The message lists the problems.
   """
-  free: frozenset[str] | None = None
-  if is_confined:
-    free = frozenset()
-    if are_overrides_free:
-      free = loading.texts_in_overrides(overrides)
 
   def problems_of(changed: Mapping[str, Any]) -> list[str]:
     try:
-      model_class.model_validate(changed, context=free)
+      model_class.model_validate(changed)
     except pydantic.ValidationError as error:
       return _problems(error, changed)
     return []
@@ -205,7 +195,7 @@ def validate(
   data = loading.with_lists(data)
   changed = loading.apply_overrides(data, overrides) if overrides else data
   with contextlib.suppress(pydantic.ValidationError):
-    return model_class.model_validate(changed, context=free)
+    return model_class.model_validate(changed)
   before = problems = problems_of(data)
   hint, changed = '', data
   for override in overrides:
@@ -221,26 +211,6 @@ def validate(
   if len(problems) > _MAX_TOLD:
     texts.append(f'and {len(problems) - _MAX_TOLD} more')
   raise messages.Location(where).error('; '.join(texts) + hint)
-
-
-def are_paths_confined(info: pydantic.ValidationInfo) -> bool:
-  """Returns True if paths must be within the working directory."""
-  return info.context is not None
-
-
-def check_path(path: str, info: pydantic.ValidationInfo) -> str:
-  """Returns a path if a field may contain it.
-
-  Raises:
-    ValueError: If not.
-  """
-  free: frozenset[str] | None = info.context
-  if free is None or path in free or loading.is_inside(path):
-    return path
-  raise ValueError(
-      f'{messages.quote(path)} is outside the working directory; allowed in'
-      ' a file are names, and paths within it'
-  )
 
 
 def _problems(error: pydantic.ValidationError, data: Any) -> list[str]:

@@ -8,7 +8,6 @@ import pydantic
 
 from realab_suite import errors
 from realab_suite.config import documents
-from realab_suite.config import loading
 from realab_suite.config import option_types
 from realab_suite.config import validation
 from realab_suite.entities import registers
@@ -253,14 +252,6 @@ class LearnerSpec(validation.Spec):
 
   kind: Name
 
-  @pydantic.model_validator(mode='after')
-  def _check_paths(self, info: pydantic.ValidationInfo) -> 'LearnerSpec':
-    # Options are validated when a learner is made, by its kind, and the file
-    # that they are from is not known then.
-    for text in loading.texts_in(self.model_extra):
-      validation.check_path(text, info)
-    return self
-
 
 # Inside the class below, `providers` is the name of a field.
 _Provider = providers.Provider
@@ -479,30 +470,21 @@ DESIGNS = _DOCUMENTS.names
 """Names of the designs that are part of the package."""
 
 
-def load(
-    design: Design,
-    overrides: Sequence[str] = (),
-    *,
-    is_confined: bool = False,
-) -> DesignSpec:
+def load(design: Design, overrides: Sequence[str] = ()) -> DesignSpec:
   """Loads and validates a design.
-
-  Paths in a design file must be within the working directory.
 
   Args:
     design: Name of a design of this package, path of a YAML file, mapping, or
       spec.
     overrides: Dotted overrides, such as `registers.reward.scale=0.2`. The
       override `channel=secure` makes the secure twin of a design.
-    is_confined: True if paths in `overrides` and the path `design` must also be
-      within the working directory.
 
   Raises:
     SpecError: If the design or an override is wrong; the message is one line
       with the file, the key path and the allowed values.
     UnknownNameError: If there is no design or file of this name.
   """
-  return _DOCUMENTS.load(design, overrides, is_confined=is_confined)
+  return _DOCUMENTS.load(design, overrides)
 
 
 def inputs_of(provider: providers.Provider, design: DesignSpec) -> list[str]:

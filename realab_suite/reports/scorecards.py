@@ -20,7 +20,6 @@ from realab_suite import errors
 from realab_suite import policies
 from realab_suite import suite
 from realab_suite import worlds
-from realab_suite.config import loading
 from realab_suite.config import task_names
 from realab_suite.config import validation
 from realab_suite.evaluation import gains
@@ -440,7 +439,7 @@ def _of_design(
   with contextlib.suppress(errors.RealabError):
     run = {**run, 'design': name}
     spec = validation.validate(experiment_specs.RunSpec, run, '')
-    if spec.load(is_confined=True).digest() == digest:
+    if spec.load().digest() == digest:
       learner = (f'learner.{key}={x}' for key, x in spec.learner.items())
       changes = ', '.join([name, *spec.overrides, *learner])
       return OWN_DESIGN if name == domain else name, changes
@@ -541,10 +540,7 @@ def _of_rows(folder: pathlib.Path) -> list[_Actor]:
   for row in results.read_rows(path) if path.is_file() else ():
     rows.setdefault(row.info.run, []).append(row)
   # The embedded design is the first one, if there are others.
-  designs = [
-      specs.load(loading.read_mapping(path), is_confined=True)
-      for path in sorted(folder.glob('design*.yaml'))
-  ]
+  designs = [specs.load(path) for path in sorted(folder.glob('design*.yaml'))]
   if not rows or not designs:
     raise errors.ResultsError(
         f'{folder}: not a sweep, and without rows or a design; must be a'

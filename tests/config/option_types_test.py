@@ -9,8 +9,8 @@ import pydantic
 import pytest
 
 from realab_suite import policies
+from realab_suite.config import option_types
 from realab_suite.feedback import specs
-from tests.config import file_readers
 from tests.config import refusals
 from tests.engine import helpers
 from tests.feedback import designs
@@ -19,9 +19,48 @@ from tests.feedback import stubs
 _REGISTER = {**designs.REWARD, 'range': [0, 13]}
 
 
+class _Labelled(stubs.Idle):
+  """The base class of a policy that passes its options on."""
+
+  def __init__(self, label: str = '', file: option_types.FilePath = '') -> None:
+    del label, file
+
+
+@final
+class _Inheriting(_Labelled):
+
+  def __init__(self, mine: int = 0, **kwargs: Any) -> None:
+    del mine
+    super().__init__(**kwargs)
+
+
+@final
+class _Wrapping(stubs.Idle):
+  """Runs another policy."""
+
+  def __init__(
+      self,
+      inner: Annotated[str, option_types.NameIn(policies.POLICIES)] = 'no_op',
+      inner_options: Annotated[
+          dict[str, Any] | None,
+          option_types.OptionsOf(policies.POLICIES, 'inner'),
+      ] = None,
+  ) -> None:
+    self._inner = policies.make(inner, **(inner_options or {}))
+
+
+def _made(label: str = '') -> policies.Policy:
+  """Makes a policy: a function instead of a class."""
+  return _Labelled(label)
+
+
 @pytest.fixture(autouse=True)
-def _readers() -> Iterator[None]:
-  with file_readers.registered():
+def _policies() -> Iterator[None]:
+  with (
+      helpers.registered(policies.POLICIES, 'test_inheriting', _Inheriting),
+      helpers.registered(policies.POLICIES, 'test_wrapping', _Wrapping),
+      helpers.registered(policies.POLICIES, 'test_function', _made),
+  ):
     yield
 
 
@@ -110,7 +149,7 @@ def _typed() -> Iterator[None]:
         " signature: name 'Nothing' is not defined"),
     ('test_wrapping', {'inner': 'no_opp'},
         ".inner: policy 'no_opp' is unknown; did you mean 'no_op'?"),
-    ('test_inheriting', {'no': 1}, ": unknown key 'no' (allowed: mine, fi"),
+    ('test_inheriting', {'no': 1}, ": unknown key 'no' (allowed: mine, la"),
     ('test_function', {'lable': 'x'}, "; did you mean 'label'? (allowed: ")
 ])  # fmt: skip
 @pytest.mark.usefixtures('_typed')

@@ -93,27 +93,20 @@ class RunSpec(validation.Spec):
       )
     return self
 
-  def load(self, *, is_confined: bool = False) -> specs.DesignSpec:
+  def load(self) -> specs.DesignSpec:
     """Returns the design with the changes of this run.
-
-    Args:
-      is_confined: True if the design and the files that it names must be within
-        the working directory.
 
     Raises:
       SpecError: If the design is invalid.
     """
-    design = specs.load(self.design, self.overrides, is_confined=is_confined)
+    design = specs.load(self.design, self.overrides)
     if not self.learner:
       return design
     learner = {} if design.learner is None else design.learner.model_dump()
     changed = {**design.to_source(), 'learner': {**learner, **self.learner}}
     # Problems from here on belong to the run and not to the file of the design.
     return validation.validate(
-        specs.DesignSpec,
-        loading.read_mapping(changed),
-        '',
-        is_confined=is_confined,
+        specs.DesignSpec, loading.read_mapping(changed), ''
     )
 
 
@@ -251,12 +244,11 @@ class ExperimentSpec(validation.Spec):
     return self
 
   @pydantic.model_validator(mode='after')
-  def _check_runs(self, info: pydantic.ValidationInfo) -> 'ExperimentSpec':
+  def _check_runs(self) -> 'ExperimentSpec':
     checked: list[Any] = []
     for name, run in self.runs.items():
       try:
-        design = run.load(is_confined=validation.are_paths_confined(info))
-        design = self.of_run(run)._fitted(design)
+        design = self.of_run(run)._fitted(run.load())
         # What learns in a world is no part of it.
         world = run.task, design.model_copy(update={'learner': None})
         if world not in checked:
@@ -423,8 +415,6 @@ EXPERIMENTS = _DOCUMENTS.names
 
 def load(experiment: Experiment) -> ExperimentSpec:
   """Loads and validates an experiment, and the designs that it names.
-
-  The designs that a file names must be within the working directory.
 
   Args:
     experiment: Name of an experiment of the package, path of a YAML file,

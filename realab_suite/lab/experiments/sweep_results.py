@@ -154,7 +154,7 @@ class Run:
   @functools.cached_property
   def design(self) -> specs.DesignSpec:
     """Design of the run."""
-    return specs.load(self.config['design'], is_confined=True)
+    return specs.load(self.config['design'])
 
   @functools.cached_property
   def world(self) -> worlds.World:
