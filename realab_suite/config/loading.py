@@ -301,7 +301,7 @@ def _mapping(loader: Any, node: yaml.MappingNode) -> dict[str, Any]:
   mapping: dict[str, Any] = {}
   lines: dict[str, int] = {}
   for key_node, value_node in node.value:
-    key = loader.construct_object(key_node, deep=True)
+    key = _built(loader, key_node)
     if not isinstance(key, str):
       raise _refusal(key_node, _wrong_key(key))
     line = key_node.start_mark.line + 1
@@ -309,8 +309,17 @@ def _mapping(loader: Any, node: yaml.MappingNode) -> dict[str, Any]:
       both = f'lines {lines[key]} and {line}'
       raise _refusal(key_node, f'duplicate key {messages.quote(key)} ({both})')
     lines[key] = line
-    mapping[key] = loader.construct_object(value_node, deep=True)
+    mapping[key] = _built(loader, value_node)
   return mapping
+
+
+def _list(loader: Any, node: yaml.SequenceNode) -> list[Any]:
+  return [_built(loader, item) for item in node.value]
+
+
+def _built(loader: Any, node: yaml.Node) -> Any:
+  # Without aliases, no object is built twice, so none need be remembered.
+  return loader.yaml_constructors[node.tag](loader, node)
 
 
 def _integer(loader: Any, node: yaml.ScalarNode) -> int:
@@ -345,6 +354,7 @@ class _Loader(_LibraryLoader):
   yaml_constructors: ClassVar[dict[Any, Any]] = {
       **yaml.SafeLoader.yaml_constructors,
       f'{_TAG}map': _mapping,
+      f'{_TAG}seq': _list,
       f'{_TAG}int': _integer,
       _AMBIGUOUS: _refuse_word,
   }
@@ -371,21 +381,7 @@ def _plain(value: Any, where: str, path: tuple[str | int, ...] = ()) -> Any:
     SpecError: If the value is not allowed in a description.
   """
   problem = ''
-  if isinstance(value, Mapping) or is_list(value):
-    if len(path) >= _MAX_DEPTH:
-      problem = _TOO_DEEP
-    elif len(value) > _MAX_ENTRIES:
-      problem = f'more than {_MAX_ENTRIES} entries'
-    elif not isinstance(value, Mapping):
-      return [_plain(one, where, (*path, i)) for i, one in enumerate(value)]
-    elif wrong := [key for key in value if not isinstance(key, str)]:
-      problem = _wrong_key(wrong[0])
-    else:
-      return {
-          _plain(key, where, path): _plain(item, where, (*path, key))
-          for key, item in value.items()
-      }
-  elif isinstance(value, str):
+  if isinstance(value, str):  # First, because most values are texts.
     # Printable characters are in none of the forbidden categories.
     problem = '' if value.isprintable() else _forbidden_character(value)
     # Not str(value): a subclass, such as a text enum, may override it.
@@ -402,6 +398,20 @@ def _plain(value: Any, where: str, path: tuple[str | int, ...] = ()) -> Any:
     if abs(value) > _MAX_INT:
       problem = f'integer {messages.quote(value)} is out of range'
     value = int(value)
+  elif isinstance(value, Mapping) or is_list(value):
+    if len(path) >= _MAX_DEPTH:
+      problem = _TOO_DEEP
+    elif len(value) > _MAX_ENTRIES:
+      problem = f'more than {_MAX_ENTRIES} entries'
+    elif not isinstance(value, Mapping):
+      return [_plain(one, where, (*path, i)) for i, one in enumerate(value)]
+    elif wrong := [key for key in value if not isinstance(key, str)]:
+      problem = _wrong_key(wrong[0])
+    else:
+      return {
+          _plain(key, where, path): _plain(item, where, (*path, key))
+          for key, item in value.items()
+      }
   elif value is not None and not isinstance(value, bool):
     problem = (
         'expected a mapping, list, string, number, boolean or null, got'
