@@ -1,6 +1,6 @@
 """No test asserts a duration or races a process.
 
-Work is counted by `tests/work.py`, and `tests/patience.py` waits for what is to
+A profile counts work in calls, and `tests/patience.py` waits for what is to
 happen. So no test reads a clock or gives up after a time of its own.
 """
 
@@ -62,6 +62,6 @@ def test_clocks_and_numeric_timeouts_are_found():
   for allowed in (
       'process.wait(patience.SECONDS)',
       "', '.join(parts)",
-      'work.num_calls(function) <= 5',
+      'num_calls(function) <= 5',
   ):
     assert not _violations(allowed), allowed
