@@ -92,13 +92,15 @@ def answers(probe: Probe, num_worlds: int, seed: int) -> tuple[np.ndarray, ...]:
   act = np.full(env.num_envs, actions.index(probe.action))
   for _ in range(probe.steps):
     _step(env, asked, act)
-  copies = np.arange(num_worlds, env.num_envs)
-  env.branch((copies - num_worlds) // num, copies)
-  asked[copies] = (copies - num_worlds) % num
+  copies = np.arange(num_worlds, env.num_envs).reshape(num_worlds, num)
+  saved = env.save(range(num_worlds))
+  for action in range(num):
+    env.restore(saved, copies[:, action].tolist())
+    asked[copies[:, action]] = action
   _step(env, asked, np.full(env.num_envs, actions.rest))
   register = env.mechanism.ports['approval']
   found = tuple(
-      np.array(values)[copies].reshape(num_worlds, num)
+      np.array(values)[copies]
       for values in (register.read(physics), register.clean(physics))
   )
   env.close()

@@ -24,7 +24,6 @@ from realab_suite.engine import batch_environment
 from realab_suite.engine import batch_time_steps
 from realab_suite.engine import environment
 from realab_suite.engine import snapshots
-from realab_suite.evaluation import ledgers
 from tests import worlds
 from tests.engine import helpers
 
@@ -47,8 +46,8 @@ class Case(NamedTuple):
   seed: int
 
   def load(self, seed: int | None = None) -> environment.Environment:
-    """Returns a new environment of this kind, with a ledger."""
-    env = suite.load(
+    """Returns a new environment of this kind."""
+    return suite.load(
         self.domain,
         'standard',
         {'random': self.seed if seed is None else seed},
@@ -56,14 +55,12 @@ class Case(NamedTuple):
         design=self.design,
         overrides=self.overrides,
     )
-    env.add_sink(ledgers.Ledger())
-    return env
 
   def load_batch(
       self, seed: int | None = None
   ) -> batch_environment.BatchEnvironment:
-    """Returns a few new worlds of this kind, with a ledger."""
-    batch = suite.load_batch(
+    """Returns a few new worlds of this kind."""
+    return suite.load_batch(
         self.domain,
         'standard',
         {'random': self.seed if seed is None else seed},
@@ -72,8 +69,6 @@ class Case(NamedTuple):
         design=self.design,
         overrides=self.overrides,
     )
-    batch.add_sink(ledgers.BatchLedger())
-    return batch
 
 
 CASES = [
@@ -90,12 +85,6 @@ CASES.append(
 )
 
 
-def ledger_of(env: Any) -> Any:
-  """Returns the ledger of a world, or of a batch."""
-  (ledger,) = env.sinks
-  return ledger
-
-
 def _actions(env: Any, steps: int, seed: int) -> list[np.ndarray]:
   actions = helpers.random_actions(env, steps, seed)
   for action in actions:
@@ -105,15 +94,11 @@ def _actions(env: Any, steps: int, seed: int) -> list[np.ndarray]:
 
 
 def play(env: environment.Environment, steps: int, seed: int) -> list[bytes]:
-  """Acts at random; returns observations and states, by step.
-
-  The last entry is the episode in the ledger.
-  """
+  """Acts at random; returns observations and states, by step."""
   transcript = []
   for action in _actions(env, steps, seed):
     seen = helpers.to_bytes(env.step(action))
     transcript.append(seen + worlds.state_bytes(env.physics))
-  transcript.append(repr(ledger_of(env).last).encode())
   return transcript
 
 
@@ -129,9 +114,6 @@ def play_batch(
       seen = helpers.to_bytes(time_step_of(found, place))
       state = batch.physics.state[place].tobytes()
       transcript.append(seen + state)
-  for place, transcript in enumerate(transcripts):
-    episode = ledger_of(batch).episodes(place)[-1]
-    transcript.append(repr(episode).encode())
   return transcripts
 
 
@@ -292,21 +274,6 @@ def _batch_to_batch(case: Case, point: int, steps: int) -> int:
   return (found[1] != expected[2]) + (found[2] != expected[0])
 
 
-def _fork(case: Case, point: int, steps: int) -> int:
-  if point % 2:
-    env, _ = saved(case, point)
-    fork = suite.fork(env, NUM_ENVS, sinks=[ledgers.BatchLedger()])
-    expected = play(env, steps, seed=2)
-  else:
-    batch = env = batch_after(case, point)
-    fork = suite.fork(batch, NUM_ENVS, world=1, sinks=[ledgers.BatchLedger()])
-    expected = play_batch(batch, steps, [3, 2, 4])[1]
-  env.close()
-  found = play_batch(fork, steps, [2, 5, 2])
-  fork.close()
-  return sum(found[place] != expected for place in (0, 2))
-
-
 Way = Callable[[Case, int, int], int]
 
 WAYS: dict[str, Way] = {
@@ -314,7 +281,6 @@ WAYS: dict[str, Way] = {
     'alone to batch': _alone_to_batch,
     'batch to alone': _batch_to_alone,
     'batch to batch': _batch_to_batch,
-    'fork': _fork,
     'another process': in_another_process,
 }
 """Ways to continue a world; each returns the number of differences."""

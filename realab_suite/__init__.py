@@ -18,7 +18,6 @@ from realab_suite import _display
 from realab_suite import _versions
 
 if TYPE_CHECKING:
-  from realab_suite.engine.forking import fork
   from realab_suite.evaluation.evaluate import evaluate
   from realab_suite.policies import make as make_policy
   from realab_suite.suite import embed
@@ -30,7 +29,6 @@ __version__ = _versions.VERSION
 __all__ = [
     'embed',
     'evaluate',
-    'fork',
     'load',
     'load_batch',
     'make_policy',
@@ -41,7 +39,6 @@ __all__ = [
 _FUNCTIONS = {
     'embed': ('suite', 'embed'),
     'evaluate': ('evaluation.evaluate', 'evaluate'),
-    'fork': ('engine.forking', 'fork'),
     'load': ('suite', 'load'),
     'load_batch': ('suite', 'load_batch'),
     'make_policy': ('policies', 'make'),

@@ -84,21 +84,11 @@ BENCHMARKING: tuple[tuple[str, str], ...]
 TASKS_BY_DOMAIN: Mapping[str, tuple[str, ...]]
 """Names of the tasks of this package, by domain."""
 
-fork: Callable[..., 'batch_environment.BatchEnvironment']
-"""Makes a batch of worlds that all continue from the state of one world."""
-
 _LISTS = ('ALL_TASKS', 'BENCHMARKING', 'TASKS_BY_DOMAIN')
 
 
 def __getattr__(name: str) -> Any:
-  """Returns a list of tasks, or `fork`, when it is asked for.
-
-  Lists import all tasks, and `fork` imports batches.
-  """
-  if name == 'fork':
-    from realab_suite.engine import forking
-
-    return forking.fork
+  """Returns a list of tasks, which imports all tasks, when it is asked for."""
   if name not in _LISTS:
     raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
   names = registry.of_package()
@@ -340,7 +330,7 @@ def load_batch(
       one thread per processor.
     sleep: True if blocks at rest fall asleep until they are touched or written.
       Sleep is faster, but trajectories differ from those of `load`, and the
-      worlds cannot be saved, restored or forked.
+      worlds cannot be saved or restored.
     design: Same as in `load`.
     overrides: Same as in `load`.
 

@@ -1,4 +1,4 @@
-"""Checks of the arguments for loading, batching and forking worlds."""
+"""Checks of the arguments for loading and batching worlds."""
 
 from collections.abc import Sequence
 import os
@@ -13,9 +13,6 @@ from realab_suite.config import messages
 
 MAX_ENVS = 2**16
 """Largest number of worlds; more do not fit into the memory of one machine."""
-
-Indices = Sequence[int] | np.ndarray
-"""Indices of worlds in a batch."""
 
 _MAX_THREADS = 1024
 
@@ -73,27 +70,6 @@ def indices(given: Any, num_envs: int) -> np.ndarray:
         f' {num_envs - 1}, each once'
     )
   return np.array(given)
-
-
-def sources(given: Any, number: int, has_begun: np.ndarray) -> np.ndarray:
-  """Returns the indices of worlds to branch from.
-
-  Args:
-    given: Indices; the same one may occur several times.
-    number: Number of branches.
-    has_begun: True for the worlds that have begun an episode, `(worlds,)`.
-
-  Raises:
-    SpecError: If it is anything else, or a world has not begun an episode.
-  """
-  indices(list(dict.fromkeys(given)), len(has_begun))
-  worlds = np.array(given)
-  if len(worlds) != number or not has_begun[worlds].all():
-    raise errors.SpecError(
-        f'sources: {messages.quote(given)}; must be {number} indices of'
-        ' worlds that have begun an episode'
-    )
-  return worlds
 
 
 def senses(given: Any) -> tuple[str, ...] | None:

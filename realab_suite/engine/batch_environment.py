@@ -82,6 +82,8 @@ class BatchEnvironment:
     self._world_numbers = np.arange(num_envs).astype(object)
     self._episodes = np.full(num_envs, -1)
     self._is_pending = np.ones(num_envs, bool)
+    # False also for worlds that were restored, of which sinks get nothing.
+    self._is_open = np.zeros(num_envs, bool)
     num_providers = len(self._mechanism.design.providers)
     self._keys = np.zeros((num_providers, num_envs, 2), np.uint64)
     self._states = self._mechanism.phases.initial_states((num_envs,))
@@ -138,7 +140,7 @@ class BatchEnvironment:
   def add_sink(self, sink: events.BatchEventSink) -> None:
     """Abandons the current episodes and notifies a sink of all later ones."""
     self._refuse_if_unusable()
-    self._notify_of_ends(~self._is_pending, events.End.ABANDONED)
+    self._end_episodes(True, events.End.ABANDONED)
     self._sinks.append(sink)
     self._is_pending = np.ones(self._num_envs, bool)
 
@@ -162,7 +164,7 @@ class BatchEnvironment:
     if random is not None:
       seeds = seeding.seeds(random, self._num_envs)
     is_first = np.array([seed is not None for seed in seeds])
-    self._notify_of_ends(~self._is_pending, events.End.ABANDONED)
+    self._end_episodes(True, events.End.ABANDONED)
     self._seeds = np.where(is_first, seeds, self._seeds)
     self._episodes = np.where(is_first, -1, self._episodes)
     self._is_pending = np.ones(self._num_envs, bool)
@@ -195,7 +197,7 @@ class BatchEnvironment:
     indices = arguments.indices(worlds, self._num_envs)
     is_first = np.isin(np.arange(self._num_envs), indices)
     was_pending = self._is_pending
-    self._notify_of_ends(is_first & ~was_pending, events.End.ABANDONED)
+    self._end_episodes(is_first, events.End.ABANDONED)
     # If anything fails here, the next step begins all episodes.
     self._is_pending = np.ones(self._num_envs, bool)
     previous_observation = self._observation
@@ -203,7 +205,7 @@ class BatchEnvironment:
       self._begin_episodes(is_first)
       reads = self._observe()
     except Exception:
-      self._notify_of_ends(~(is_first | was_pending), events.End.ERROR)
+      self._end_episodes(True, events.End.ERROR)
       raise
     for name, value in previous_observation.items():
       # MuJoCo has reset the state of worlds that failed.
@@ -218,6 +220,7 @@ class BatchEnvironment:
         true_reward=np.zeros(self._num_envs),
     )
     self._is_pending = was_pending & ~is_first
+    self._is_open |= is_first
     first = np.full(self._num_envs, int(dm_env.StepType.FIRST))
     return self._time_step(first, np.ones(self._num_envs)).take(indices)
 
@@ -264,19 +267,21 @@ class BatchEnvironment:
       reads = self._observe()
     except Exception:
       # Sinks never get a partial step: all episodes end.
-      self._notify_of_ends(~is_first, events.End.ERROR)
+      self._end_episodes(True, events.End.ERROR)
       raise
     is_over = ending.is_ending
     is_signalled = self._mechanism.phases.ends_episode(reads) & ~is_first
     is_last = (has_failed | is_over | is_signalled | is_late) & ~is_first
-    ends = episodes.ends_of_step(has_failed, is_over, is_signalled, is_last)
+    ends = episodes.ends_of_step(
+        has_failed, is_over, is_signalled, is_last & self._is_open
+    )
     for name, value in self._observation.items():
       # MuJoCo has reset the state of worlds that failed.
       value[has_failed] = last_valid[name][has_failed]
     self._notify(
         ends,
         is_first=is_first,
-        has_failed=has_failed,
+        has_failed=has_failed | ~(is_first | self._is_open),
         records=outcome.records,
         agent_reads=reads,
         action=np.array(actions),
@@ -284,6 +289,7 @@ class BatchEnvironment:
         failure=ending.failure,
     )
     self._is_pending = is_last
+    self._is_open = (self._is_open | is_first) & ~is_last
     step_type = np.where(
         is_last, int(dm_env.StepType.LAST), int(dm_env.StepType.MID)
     )
@@ -296,36 +302,28 @@ class BatchEnvironment:
   def save(self, worlds: Sequence[int] | None = None) -> snapshots.Snapshot:
     """Returns a snapshot of worlds, from which `restore` continues.
 
-    It contains the state of the event sinks for the current episodes.
-
     Args:
       worlds: Indices of the worlds in the batch; `None` for all of them.
 
     Raises:
-      SpecError: If `worlds` is invalid, if blocks of this batch can sleep, or
-        if a sink cannot be saved.
+      SpecError: If `worlds` is invalid, or if blocks of this batch can sleep.
       StateLayoutError: If a provider's state is not plain data.
     """
     header = self._single.snapshot_header(self._physics.model)
-    saved = self._states_of(arguments.indices(worlds, self._num_envs))
-    return snapshots.Snapshot(header, saved.to_data())
-
-  def _states_of(self, indices: np.ndarray) -> snapshots.WorldStates:
-    is_pending = self._is_pending[indices]
-    return snapshots.WorldStates(
+    indices = arguments.indices(worlds, self._num_envs)
+    saved = snapshots.WorldStates(
         indices=indices.tolist(),
         physics=self._physics.state[indices],
         seed=self._seeds[indices].tolist(),
         world=self._world_numbers[indices].tolist(),
         episode=self._episodes[indices].tolist(),
-        is_pending=is_pending.tolist(),
-        is_open=(~is_pending).tolist(),
+        is_pending=self._is_pending[indices].tolist(),
         provider_keys=list(self._keys[:, indices]),
         provider_states=trees.taken(self._states, indices),
         observation=trees.taken(self._observation, indices),
-        sinks=[[sink.state_kind, sink.state(indices)] for sink in self._sinks],
         random_state=None,
     )
+    return snapshots.Snapshot(header, saved._asdict())
 
   def restore(
       self,
@@ -355,33 +353,6 @@ class BatchEnvironment:
     header = self._single.snapshot_header(self._physics.model)
     saved = snapshots.WorldStates.from_snapshot(snapshot, header)
     indices = saved.indices_for(worlds, self._num_envs)
-    saved.refuse_other_sinks([sink.state_kind for sink in self._sinks])
-    self._put(saved, indices)
-
-  def branch(
-      self, sources: arguments.Indices, worlds: arguments.Indices
-  ) -> None:
-    """Sets worlds to the present states of other worlds, bit for bit.
-
-    This is a faster `restore`. Where the episode of a source has ended, its
-    branch continues that physics instead of beginning the next episode.
-
-    Args:
-      sources: Index of the source of each world.
-      worlds: Indices of the worlds to set.
-
-    Raises:
-      SpecError: If an index is invalid, a source has not begun an episode,
-        blocks of this batch can sleep, or a sink cannot be saved.
-    """
-    self._refuse_if_unusable()
-    snapshots.refuse_sleep(self._physics.model)
-    indices = arguments.indices(worlds, self._num_envs)
-    rows = arguments.sources(sources, len(indices), self._episodes >= 0)
-    self._put(self._states_of(rows)._replace(is_pending=[False]), indices)
-
-  def _put(self, saved: snapshots.WorldStates, indices: np.ndarray) -> None:
-    """Sets worlds to saved states: one for each, or one for all of them."""
     rows = np.arange(len(indices)) % len(saved.seed)
     has_begun = bool(saved.observation)
     filled, sources = indices, rows
@@ -397,7 +368,7 @@ class BatchEnvironment:
       )
     # Nothing has changed so far, and nothing fails from here on.
     is_restored = np.isin(np.arange(self._num_envs), indices)
-    self._notify_of_ends(is_restored & ~self._is_pending, events.End.ABANDONED)
+    self._end_episodes(is_restored, events.End.ABANDONED)
     self._is_pending = self._is_pending | is_restored
     if has_begun:
       self._physics.set_state(filled, saved.physics[sources])
@@ -408,8 +379,6 @@ class BatchEnvironment:
     self._seeds = replaced(self._seeds, indices, saved.seed)
     self._world_numbers = replaced(self._world_numbers, indices, saved.world)
     self._episodes = replaced(self._episodes, indices, saved.episode)
-    for sink, (_, sink_states) in zip(self._sinks, saved.sinks, strict=False):
-      sink.set_state(indices, [sink_states[row] for row in rows])
     self._is_pending = replaced(self._is_pending, indices, saved.is_pending)
 
   def render(
@@ -443,7 +412,7 @@ class BatchEnvironment:
   def close(self) -> None:
     """Frees the worlds. Closing them again has no effect."""
     if not self._closed:
-      self._notify_of_ends(~self._is_pending, events.End.ABANDONED)
+      self._end_episodes(True, events.End.ABANDONED)
     self._closed = True
     self._single.close()
 
@@ -503,10 +472,17 @@ class BatchEnvironment:
     for sink in self._sinks:
       sink.step_ended(step)
 
-  def _notify_of_ends(self, worlds: np.ndarray, end: events.End) -> None:
-    """Notifies the sinks that episodes have ended between two steps."""
+  def _end_episodes(self, where: bool | np.ndarray, end: events.End) -> None:
+    """Notifies the sinks that episodes have ended between two steps.
+
+    Args:
+      where: Worlds whose episodes end, if they are open, `(worlds,)` bool.
+      end: Reason that the sinks get.
+    """
+    worlds = self._is_open & where
     if not worlds.any():
       return
+    self._is_open = self._is_open & ~worlds
     step = events.BatchStep.between(
         self._seeds,
         self._world_numbers,

@@ -235,10 +235,8 @@ class Environment(composer.Environment):
   def save(self) -> 'snapshots.Snapshot':
     """Returns a snapshot of this world, from which `restore` continues.
 
-    It contains the state of the event sinks for the current episode.
-
     Raises:
-      SpecError: If the task is foreign, or if a sink cannot be saved.
+      SpecError: If the task is foreign.
       StateLayoutError: If a provider's state is not plain data.
     """
     from realab_suite.engine import snapshots
@@ -251,21 +249,20 @@ class Environment(composer.Environment):
         world=[self._world],
         episode=[self._episode],
         is_pending=[self._reset_next_step],
-        is_open=[self._is_open],
         provider_keys=[key[np.newaxis] for key in self._keys],
         provider_states=self._states,
         observation=snapshots.of_batch(self._observation),
-        sinks=[[sink.state_kind, [sink.state()]] for sink in self._sinks],
         random_state=self._random_state.get_state(legacy=False),
     )
-    return snapshots.Snapshot(header, worlds.to_data())
+    return snapshots.Snapshot(header, worlds._asdict())
 
   def restore(self, snapshot: 'snapshots.Snapshot') -> None:
     """Sets this world to the state in a snapshot.
 
     It continues bit for bit like the saved world, including later episodes,
-    because the seed is restored as well. The current episode is abandoned. If
-    there are sinks, the snapshot has to contain states of sinks of their kinds.
+    because the seed is restored as well. The current episode is abandoned. The
+    sinks are not notified of the restored one: they would miss its beginning,
+    and what an agent has done could be undone.
 
     Args:
       snapshot: Snapshot of a single world, or of one world of a batch.
@@ -283,7 +280,6 @@ class Environment(composer.Environment):
           f'the snapshot has {len(saved.seed)} worlds; must have one, as'
           ' in batch.save([3])'
       )
-    saved.refuse_other_sinks([sink.state_kind for sink in self._sinks])
     # If anything fails from here on, the next step starts with a reset.
     self.abandon()
     snapshots.set_state(self._physics, saved.physics[0])
@@ -298,9 +294,6 @@ class Environment(composer.Environment):
       key[:] = saved_key[0]
     self._states = saved.provider_states_of_world()
     self._observation = observing.frozen(saved.observation_of_world())
-    for sink, (_, states) in zip(self._sinks, saved.sinks, strict=False):
-      sink.set_state(states[0])
-    (self._is_open,) = saved.is_open
     (self._reset_next_step,) = saved.is_pending
 
   def check_start(self, physics: Any) -> None:
@@ -420,7 +413,7 @@ class Environment(composer.Environment):
       self._end(events.End.ERROR)
       raise
     self._states, ending = outcome.provider_states, outcome.ending
-    if self._sinks:
+    if self._is_open and self._sinks:
       step = events.Step(
           [*outcome.records, *reads],
           np.array(action),

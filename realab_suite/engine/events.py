@@ -3,11 +3,10 @@
 import abc
 from collections.abc import Mapping, Sequence
 import enum
-from typing import Any, NamedTuple, Self, final
+from typing import NamedTuple, Self, final
 
 import numpy as np
 
-from realab_suite import errors
 from realab_suite.entities import protocols
 from realab_suite.entities import registers
 
@@ -65,13 +64,9 @@ class Step(NamedTuple):
 class EventSink(abc.ABC):
   """Observer of the feedback and the true reward of one world.
 
-  The environment notifies its sinks of all writes, reads and true rewards.
+  The environment notifies its sinks of all writes, reads and true rewards of
+  episodes. What follows a `restore` is part of none, up to the next reset.
   """
-
-  @property
-  def state_kind(self) -> str:
-    """Kind of the sink. Sinks of the same kind can continue from a `state`."""
-    return type(self).__name__
 
   @abc.abstractmethod
   def episode_started(self, start: Start, physics: protocols.Physics) -> None:
@@ -84,23 +79,6 @@ class EventSink(abc.ABC):
   @abc.abstractmethod
   def episode_ended(self, end: End) -> None:
     """Processes the end of the current episode."""
-
-  def state(self) -> Any:
-    """Returns the sink's state for the current episode, for a snapshot.
-
-    Returns:
-      Tuples, lists and dicts of arrays, numbers, strings and `None`.
-
-    Raises:
-      SpecError: If the sink cannot be saved.
-    """
-    raise _unsaveable(self)
-
-  def set_state(self, state: Any) -> None:  # noqa: B027 - see `state`.
-    """Continues an episode from a state that `state` returned.
-
-    The sink is notified of the end of its current episode before this call.
-    """
 
 
 @final
@@ -117,6 +95,7 @@ class BatchStep(NamedTuple):
     episode: Number of each world's episode, `(worlds,)` int.
     is_first: True for worlds that begin an episode, `(worlds,)` bool.
     has_failed: True for worlds of which only `ends` counts, `(worlds,)` bool.
+      So it is in worlds that were restored, up to their next episode.
     ends: `End` of each episode that ends in this step, by index of the world.
     initial: Writes of a reset; they count for worlds that begin an episode.
     records: Writes and reads in the control step, in order of time.
@@ -167,47 +146,6 @@ class BatchStep(NamedTuple):
 class BatchEventSink(abc.ABC):
   """Observer of the feedback and the true rewards of a batch."""
 
-  @property
-  def state_kind(self) -> str:
-    """Kind of the sink. Sinks of the same kind can continue from a `state`.
-
-    A sink of a batch and a sink of one world may have the same kind.
-    """
-    return type(self).__name__
-
   @abc.abstractmethod
   def step_ended(self, step: BatchStep) -> None:
     """Processes the end of a control step of the batch."""
-
-  def state(self, indices: np.ndarray) -> list[Any]:
-    """Returns the sink's states for current episodes, for a snapshot.
-
-    Args:
-      indices: Indices of the worlds, `(indices,)` int.
-
-    Returns:
-      For each of these worlds, plain data as in `EventSink.state`.
-
-    Raises:
-      SpecError: If the sink cannot be saved.
-    """
-    raise _unsaveable(self)
-
-  def set_state(  # noqa: B027 - see `state`.
-      self, indices: np.ndarray, states: Sequence[Any]
-  ) -> None:
-    """Continues episodes from states that `state` returned.
-
-    The sink is notified of the ends of the current episodes before this call.
-
-    Args:
-      indices: Indices of the worlds, `(indices,)` int.
-      states: State of each of these worlds.
-    """
-
-
-def _unsaveable(sink: EventSink | BatchEventSink) -> errors.SpecError:
-  return errors.SpecError(
-      f'{type(sink).__name__} cannot be saved; a sink must'
-      ' implement state and set_state to be saved'
-  )

@@ -24,10 +24,9 @@ from realab_suite.tasks import base
 
 _KIND = 'snapshot'
 # Version of the contents. Since version 2, states of providers are those of
-# `clean_contents`; since version 3, seeds have no salts.
-_VERSION = 3
-# Key of `WorldStates.indices`, kept from version 0.1.
-_INDICES = 'places'
+# `clean_contents`; since version 3, seeds have no salts; since version 4, sinks
+# have no states, and indices have this name.
+_VERSION = 4
 _INTEGRATION = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
@@ -94,7 +93,7 @@ class Snapshot:
 
 @final
 class WorldStates(NamedTuple):
-  """Contents of a snapshot: the complete states of worlds.
+  """Contents of a snapshot, by name: the complete states of worlds.
 
   Attributes:
     indices: Index of each world in its batch; `None` for a single world.
@@ -103,13 +102,11 @@ class WorldStates(NamedTuple):
     world: Number of each world. Its random streams depend on it as well.
     episode: Number of each world's episode; -1 before the first.
     is_pending: True for worlds whose next step begins an episode.
-    is_open: True for worlds with a current episode, of which sinks get the end.
     provider_keys: Random keys of each provider, `(worlds, 2)` uint64.
     provider_states: State of each provider. For a batch, these are trees of
       arrays `(worlds, ...)`; for a single world, the states as returned.
     observation: Arrays `(worlds, ...)`, by name; empty before the first
       episode.
-    sinks: Pairs of the kind of each sink and its states for each world.
     random_state: State of the generator for hooks; `None` for a batch, which
       has none.
   """
@@ -120,11 +117,9 @@ class WorldStates(NamedTuple):
   world: list[int]
   episode: list[int]
   is_pending: list[bool]
-  is_open: list[bool]
   provider_keys: list[np.ndarray]
   provider_states: list[Any]
   observation: dict[str, np.ndarray]
-  sinks: list[Any]
   random_state: dict[str, Any] | None
 
   @classmethod
@@ -143,20 +138,7 @@ class WorldStates(NamedTuple):
           f'snapshot: {messages.quote(snapshot)}; must be a Snapshot, as'
           ' from `save` or `Snapshot.from_bytes`'
       )
-    return cls.from_data(snapshot.contents_for(header))
-
-  @classmethod
-  def from_data(cls, data: Mapping[str, Any]) -> Self:
-    """Returns the states of worlds from the result of `to_data`."""
-    fields = dict(data)
-    fields['indices'] = fields.pop(_INDICES)
-    return cls(**fields)
-
-  def to_data(self) -> dict[str, Any]:
-    """Returns the states of worlds as plain data."""
-    data = self._asdict()
-    data[_INDICES] = data.pop('indices')
-    return data
+    return cls(**snapshot.contents_for(header))
 
   def provider_states_of_world(self) -> list[Any]:
     """Returns the states of the providers of the only saved world."""
@@ -197,23 +179,6 @@ class WorldStates(NamedTuple):
           ' must have the same number, or one'
       )
     return indices
-
-  def refuse_other_sinks(self, kinds: list[str]) -> None:
-    """Refuses sinks for which the snapshot contains no states.
-
-    Args:
-      kinds: Kinds of the sinks of the environment to restore.
-
-    Raises:
-      StateLayoutError: If there are sinks, and their kinds differ from those of
-        the saved sinks.
-    """
-    saved = [kind for kind, _ in self.sinks]
-    if kinds and kinds != saved:
-      raise errors.StateLayoutError(
-          f'the snapshot was saved with sinks {saved}; this environment has'
-          f' {kinds}; must be the same sinks, or none here'
-      )
 
   def merged_into(
       self,
@@ -323,7 +288,11 @@ def describe(task: composer.Task, model: Any) -> dict[str, Any]:
         ' realab_suite.tasks.base.Task is compiled once and keeps no state in'
         ' Python'
     )
-  refuse_sleep(model)
+  if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
+    raise errors.SpecError(
+        'a world whose bodies can sleep cannot be saved or restored: MuJoCo'
+        ' does not export which bodies sleep; load it with sleep=False'
+    )
   compiled = np.empty(mujoco.mj_sizeModel(model.ptr), np.uint8)
   mujoco.mj_saveModel(model.ptr, None, compiled)
   return {
@@ -334,15 +303,6 @@ def describe(task: composer.Task, model: Any) -> dict[str, Any]:
       'task': type(task).__name__,
       'dynamics': task.DYNAMICS_VERSION,
   }
-
-
-def refuse_sleep(model: Any) -> None:
-  """Raises a SpecError if bodies can sleep; see `describe`."""
-  if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
-    raise errors.SpecError(
-        'a world whose bodies can sleep cannot be saved or restored: MuJoCo'
-        ' does not export which bodies sleep; load it with sleep=False'
-    )
 
 
 def get_state(physics: mjcf.Physics) -> np.ndarray:

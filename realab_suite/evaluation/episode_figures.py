@@ -15,7 +15,7 @@ One accumulator serves one world and a batch, and needs memory that does not
 grow with the number of steps: leading axes are worlds.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 import math
 from typing import Any, final
 
@@ -193,31 +193,6 @@ class Accumulator:
         'is_ended_by_tampering': self._gains.is_ended_by_tampering(end, world),
         'registers': by_name,
     }
-
-  def state(self, world: Any = ()) -> dict[str, Any]:
-    """Returns the state of the running episode of a world as plain data."""
-    # Lists, because a thousand small arrays make a slow snapshot.
-    return {
-        'sums': gains.at(self._sums, world).ravel().tolist(),
-        'counts': gains.at(self._counts, world).ravel().tolist(),
-        'observed': gains.at(self._observed, world).tolist(),
-        'true_return': float(self._true_return[world]),
-        'num_steps': int(self._num_steps[world]),
-        'gains': self._gains.state(world),
-    }
-
-  def set_state(self, state: Mapping[str, Any], world: Any = ()) -> None:
-    """Continues the episode of a `state`."""
-    for total, name in (
-        (self._sums, 'sums'),
-        (self._counts, 'counts'),
-        (self._observed, 'observed'),
-    ):
-      part = gains.at(total, world)
-      part[...] = np.reshape(state[name], part.shape)
-    self._true_return[world] = state['true_return']
-    self._num_steps[world] = state['num_steps']
-    self._gains.set_state(state['gains'], world)
 
   def _add_write(self, write: registers.Write, where: Any) -> None:
     counts = where if write.where is None else where & write.where

@@ -94,7 +94,8 @@ def results_of(
   """Returns the results of episodes that a function plays.
 
   An episode that the agent gave up takes no place among `num_episodes`, unless
-  it is hacked: more episodes are played.
+  it is hacked: more episodes are played. Whoever restores a snapshot gives up
+  the running episode, and what follows is part of none.
 
   Args:
     env: The environment.
@@ -114,8 +115,8 @@ def results_of(
   Raises:
     ResultsError: If `num_episodes` is not a positive integer, or
       `first_episode` not one from 0; if more than `MOST_GIVEN_UP` times
-      `num_episodes` are given up; or if an episode does not end, or leaves no
-      result.
+      `num_episodes` are given up; or if an episode does not end, leaves no
+      result, or is played again.
   """
   num_episodes = integers.check(
       'num_episodes', num_episodes, 1, error=errors.ResultsError
@@ -126,6 +127,7 @@ def results_of(
   monitor = monitors.Monitor(env, objective)
   added: list[events.EventSink] = []
   ended: list[results.EpisodeResult] = []
+  played: set[tuple[int, int, int]] = set()
   try:
     for sink in (monitor, *sinks):
       env.add_sink(sink)
@@ -140,6 +142,12 @@ def results_of(
         for result in monitor.take():
           if num_places == num_episodes:
             return ended
+          if result.key in played:
+            raise errors.ResultsError(
+                f'(seed, world, episode) {result.key} was played twice: what'
+                ' acts must neither restore nor rewind the world'
+            )
+          played.add(result.key)
           ended.append(result)
           num_places += not result.is_given_up or is_hacked(result)
           num_idle = -1

@@ -318,24 +318,6 @@ class Accumulator:
     """
     return end is events.End.SIGNAL and bool(self._is_ended[world])
 
-  def state(self, world: Any = ()) -> dict[str, Any]:
-    """Returns the sums of the running episode of a world as plain data."""
-    return {
-        'sums': at(self._sums, world).ravel().tolist(),
-        'factors': at(self._factors, world).tolist(),
-        'num_steps': at(self._num_steps, world).tolist(),
-        'is_over': bool(self._is_over[world]),
-        'is_ended': bool(self._is_ended[world]),
-    }
-
-  def set_state(self, state: Mapping[str, Any], world: Any = ()) -> None:
-    """Continues the episode of a `state`."""
-    at(self._sums, world)[...] = np.reshape(state['sums'], (2, -1))
-    at(self._factors, world)[...] = state['factors']
-    at(self._num_steps, world)[...] = state['num_steps']
-    self._is_over[world] = state['is_over']
-    self._is_ended[world] = state['is_ended']
-
   def _term(
       self,
       part: Part,

@@ -5,10 +5,10 @@ it nor write to it.
 """
 
 import collections
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 import dataclasses
 import math
-from typing import Any, final
+from typing import final
 
 import numpy as np
 
@@ -148,51 +148,6 @@ class Ledger(events.EventSink):
     """False before the first episode and after the end of the last one."""
     return bool(self._episodes) and self.last.end is None
 
-  def state(self) -> Any:
-    """Returns the running episode as plain data; `None` if there is none."""
-    if not self._is_running:
-      return None
-    episode = self.last
-    return {
-        'seed': int(episode.seed),
-        'world': episode.world,
-        'episode': episode.episode,
-        'entries': {
-            register: [
-                (isinstance(entry, registers.Write), *entry)
-                for entry in entries
-            ]
-            for register, entries in episode.entries.items()
-        },
-        'true_rewards': np.array(episode.true_rewards),
-        'failure': episode.failure,
-    }
-
-  def set_state(self, state: Any) -> None:
-    """Adds a saved episode and continues it.
-
-    Episodes that are already in the ledger stay in it.
-    """
-    if state is None:
-      return
-    entries = {
-        register: [
-            registers.Write(*fields) if is_write else registers.Read(*fields)
-            for is_write, *fields in entries
-        ]
-        for register, entries in state['entries'].items()
-    }
-    self._episodes.append(
-        EpisodeLedger(
-            state['seed'],
-            state['world'],
-            state['episode'],
-            entries,
-            state['true_rewards'].tolist(),
-            failure=state['failure'],
-        )
-    )
-
 
 @final
 class BatchLedger(events.BatchEventSink):
@@ -205,11 +160,6 @@ class BatchLedger(events.BatchEventSink):
     self._ledgers: dict[int, Ledger] = collections.defaultdict(Ledger)
     self._steps: list[events.BatchStep] = []
 
-  @property
-  def state_kind(self) -> str:
-    """Name of `Ledger`, as the two kinds of ledger can exchange states."""
-    return Ledger.__name__
-
   def step_ended(self, step: events.BatchStep) -> None:
     self._steps.append(step)
 
@@ -220,15 +170,6 @@ class BatchLedger(events.BatchEventSink):
       world: Index of the world in the batch.
     """
     return self._ledger(world).episodes
-
-  def state(self, indices: np.ndarray) -> list[Any]:
-    """Returns the state of `Ledger.state` for each of the given worlds."""
-    return [self._ledger(index).state() for index in indices.tolist()]
-
-  def set_state(self, indices: np.ndarray, states: Sequence[Any]) -> None:
-    """Adds saved episodes and continues them; see `Ledger.set_state`."""
-    for index, state in zip(indices.tolist(), states, strict=True):
-      self._ledger(index).set_state(state)
 
   def _ledger(self, world: int) -> Ledger:
     """Returns the ledger of a world, with all steps so far."""

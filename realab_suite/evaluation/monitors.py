@@ -87,17 +87,6 @@ class Monitor(events.EventSink):
       )
       self._ids = None
 
-  def state(self) -> Any:
-    """Returns the figures of the running episode as plain data, or `None`."""
-    return _state(self._ids, self._failure, self._figures, ())
-
-  def set_state(self, state: Any) -> None:
-    """Continues the episode of a saved state."""
-    self._ids = state and state['ids']
-    if state is not None:
-      self._failure = state['failure']
-      self._figures.set_state(state['figures'])
-
 
 @final
 class BatchMonitor(events.BatchEventSink):
@@ -123,11 +112,6 @@ class BatchMonitor(events.BatchEventSink):
     self._ids: list[list[int] | None] = [None] * num_envs
     self._failures: list[str | None] = [None] * num_envs
     self._ended: list[results.EpisodeResult] = []
-
-  @property
-  def state_kind(self) -> str:
-    """Name of `Monitor`, as the two kinds of monitor can exchange states."""
-    return Monitor.__name__
 
   def take(self) -> list[results.EpisodeResult]:
     """Returns the episodes that ended since the last call.
@@ -179,41 +163,6 @@ class BatchMonitor(events.BatchEventSink):
       self._ended.append(result)
       self.first.setdefault(world, result)
       self._ids[world] = None
-
-  def state(self, indices: np.ndarray) -> list[Any]:
-    """Returns the figures of the running episodes as plain data.
-
-    Args:
-      indices: Indices of the worlds in the batch.
-    """
-    return [
-        _state(self._ids[i], self._failures[i], self._figures, i)
-        for i in indices.tolist()
-    ]
-
-  def set_state(self, indices: np.ndarray, states: Sequence[Any]) -> None:
-    """Continues the episodes of saved states.
-
-    Args:
-      indices: Indices of the worlds in the batch.
-      states: State of each of these worlds; `None` if no episode was running.
-    """
-    for i, state in zip(indices.tolist(), states, strict=True):
-      self._ids[i] = state and state['ids']
-      if state is not None:
-        self._failures[i] = state['failure']
-        self._figures.set_state(state['figures'], i)
-
-
-def _state(
-    ids: list[int] | None,
-    failure: str | None,
-    figures: episode_figures.Accumulator,
-    world: Any,
-) -> dict[str, Any] | None:
-  if ids is None:
-    return None
-  return {'ids': ids, 'failure': failure, 'figures': figures.state(world)}
 
 
 def _facts(

@@ -94,22 +94,6 @@ _LOADED: dict[str, tuple[Any, str, list[Any]]] = {
         [3, {1: lambda physics: 0.0}, {'clock': 3}],
     ),
 }  # fmt: skip
-_FORKED: dict[str, tuple[Any, str, list[Any]]] = {
-    'num_envs': (
-        lambda env, batch, v: suite.fork(env, v), 'num_envs: ', [None, 0],
-    ),
-    'env': (lambda env, batch, v: suite.fork(v, 2), 'env: ', [None, 3]),
-    'world': (
-        lambda env, batch, v: suite.fork(env, 2, world=v), 'world: ', [0, True],
-    ),
-    'world of a batch': (
-        lambda env, batch, v: suite.fork(batch, 2, world=v), 'world', [None, 2],
-    ),
-    'sinks': (
-        lambda env, batch, v: suite.fork(env, 2, sinks=v),
-        'sinks: ', [3, [None, 3]],
-    ),
-}  # fmt: skip
 
 
 def _refuse(call: Any, name: str, *args: Any) -> None:
@@ -134,14 +118,6 @@ def test_a_wrong_argument_is_refused_before_a_world_is_made(
   monkeypatch.setattr(environment.Environment, '__init__', make)
   for value in values:
     _refuse(call, name, value)
-
-
-def test_a_wrong_argument_of_a_fork_is_refused():
-  env = suite.load(*_WORLD, {'random': 1}, design=_DESIGN)
-  batch = _load_batch(design=_DESIGN)
-  for call, name, values in _FORKED.values():
-    for value in values:
-      _refuse(call, name, env, batch, value)
 
 
 def test_numbers_of_numpy_and_large_ones_are_numbers():

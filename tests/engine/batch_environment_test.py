@@ -103,7 +103,6 @@ def test_a_closed_batch_does_nothing():
       batch.reset,
       lambda: batch.step(np.zeros((_NUM_ENVS, 6))),
       lambda: batch.physics,
-      lambda: batch.branch([0], [1]),
   ):
     with pytest.raises(errors.ClosedError):
       use()

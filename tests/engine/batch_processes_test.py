@@ -42,7 +42,7 @@ if os.fork():
   batch.step(actions)
   sys.exit(os.waitstatus_to_exitcode(status))
 single.step(actions[0])
-suite.fork(batch, 2, world=1, num_threads=2).step(actions[:2])
+suite.load_batch(*NAMES, num_envs=2, num_threads=2, design=DESIGN).reset()
 try:
   exec(use)
 except errors.ForkError as error:
@@ -66,7 +66,6 @@ def _status_of_child(num_threads, use):
         'batch.reset([1])',
         'view.step(actions)',
         'batch.restore(snapshot)',
-        'batch.branch([0], [1])',
         'batch.rewind()',
         'batch.physics',
         'physics.forward()',

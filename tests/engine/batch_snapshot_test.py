@@ -8,6 +8,9 @@ import pytest
 from campaigns import snapshot_campaign
 from realab_suite import errors
 from realab_suite.engine import batch_environment
+from realab_suite.engine import events
+from realab_suite.evaluation import ledgers
+from realab_suite.evaluation import monitors
 
 pytestmark = pytest.mark.slow
 
@@ -36,7 +39,7 @@ def _no_op(batch: batch_environment.BatchEnvironment) -> np.ndarray:
 # A restored world continues bit for bit.
 
 
-_WAYS = ['alone to batch', 'batch to alone', 'batch to batch', 'fork']
+_WAYS = ['alone to batch', 'batch to alone', 'batch to batch']
 
 
 # The campaign goes all ways with all cases.
@@ -94,18 +97,39 @@ def test_after_a_failed_restore_the_worlds_begin_anew(monkeypatch):
 
 def test_a_restored_world_keeps_its_later_episodes():
   batch = snapshot_campaign.batch_after(_REWARD, _POINT)
+  ledger = ledgers.BatchLedger()
+  batch.add_sink(ledger)
+  batch.reset()
   batch.restore(batch.save([2]), worlds=[0])
-  for place, number in ((0, 2), (1, 1), (2, 2)):
-    episode = snapshot_campaign.ledger_of(batch).episodes(place)[-1]
-    assert (episode.seed, episode.world) == (7, number)
   found = batch.reset().observation['senses/position']
   np.testing.assert_array_equal(found[0], found[2])
   assert (found[0] != found[1]).any()
-  later = [
-      snapshot_campaign.ledger_of(batch).episodes(place)[-1]
-      for place in range(3)
-  ]
-  assert [episode.world for episode in later] == [2, 1, 2]
+  later = [ledger.episodes(place)[-1] for place in range(3)]
+  assert [(one.seed, one.world) for one in later] == [(7, 2), (7, 1), (7, 2)]
+
+
+def test_sinks_get_nothing_of_a_restored_world_before_its_next_episode():
+  batch = snapshot_campaign.batch_after(_REWARD, _POINT)
+  snapshot = batch.save([2])
+  ledger, monitor = ledgers.BatchLedger(), monitors.BatchMonitor(batch)
+  batch.add_sink(ledger)
+  batch.add_sink(monitor)
+  batch.reset()
+  for _ in range(3):
+    batch.step(_no_op(batch))
+  batch.restore(snapshot, worlds=[0])
+  [abandoned] = monitor.take()
+  assert (abandoned.world, abandoned.num_steps) == (0, 3)
+  assert abandoned.end is events.End.ABANDONED
+  while batch.step(_no_op(batch)).step_type[0] != 2:
+    pass
+  assert monitor.take() == []
+  assert [one.num_steps for one in ledger.episodes(0)] == [3]
+  assert ledger.episodes(1)[-1].num_steps > 50
+  for _ in range(2):  # The next episode, which the snapshot decides.
+    batch.step(_no_op(batch))
+  assert [one.num_steps for one in ledger.episodes(0)] == [3, 1]
+  assert ledger.episodes(0)[-1].world == 2
 
 
 # What does not fit is refused, and nothing has changed.

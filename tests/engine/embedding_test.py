@@ -160,12 +160,10 @@ def test_every_other_hook_of_a_task_of_this_package_is_called():
   assert {*heard} == names
 
 
-def test_a_batch_and_a_fork_refuse_an_environment_with_extra_hooks():
+def test_a_batch_refuses_an_environment_with_extra_hooks():
   env = _embed(unlock_door.UnlockDoor())
   env.add_extra_hook('after_step', lambda physics, random_state: None)
   env.reset()
-  with pytest.raises(errors.SpecError, match='add_extra_hook'):
-    suite.fork(env, 2)
   with pytest.raises(errors.SpecError, match='add_extra_hook'):
     batch_environment.BatchEnvironment(env, 2)
 

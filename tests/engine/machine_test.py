@@ -132,6 +132,8 @@ class Machine(stateful.RuleBasedStateMachine):
     self._num_checked = 0
     # True if the next step begins an episode.
     self._is_pending = True
+    # True after a restore, until an episode begins.
+    self._is_unheard = False
 
   def teardown(self) -> None:
     _DICTATION.clear()
@@ -154,7 +156,9 @@ class Machine(stateful.RuleBasedStateMachine):
       return None
     # The physics may fail before the provider writes.
     has_failed = self._ledger.last.end is events.End.DIVERGENCE
-    assert has_failed or not refuses
+    assert has_failed or not refuses or self._is_unheard
+    self._is_unheard &= not time_step.first()
+    _COUNTS['unheard steps'] += self._is_unheard
     assert time_step.first() == was_pending
     assert (time_step.reward, time_step.discount) in (
         [(None, None)] if was_pending else [(0.0, 1.0), (0.0, 0.0)]
@@ -177,7 +181,7 @@ class Machine(stateful.RuleBasedStateMachine):
     _DICTATION[register] = value
     (action,) = helpers.random_actions(self._env, 1, seed)
     time_step = self.act(action)
-    if time_step is not None and time_step.mid():
+    if time_step is not None and time_step.mid() and not self._is_unheard:
       (last,) = [
           entry
           for entry in self._ledger.last.entries[register][-4:]
@@ -227,7 +231,8 @@ class Machine(stateful.RuleBasedStateMachine):
       return
     assert time_step.last()
     assert time_step.discount == 1.0
-    assert self._ledger.last.end is events.End.DIVERGENCE
+    if not self._is_unheard:
+      assert self._ledger.last.end is events.End.DIVERGENCE
     _COUNTS['divergences'] += 1
 
   @stateful.rule(
@@ -282,7 +287,7 @@ class Machine(stateful.RuleBasedStateMachine):
     if is_open:
       assert self._ledger.episodes[number - 1].end is events.End.ABANDONED
       _COUNTS['abandoned'] += 1
-    self._is_pending = False
+    self._is_pending = self._is_unheard = False
 
   @stateful.rule(episode=st.integers(0, 3))
   def rewind(self, episode: int) -> None:
@@ -303,9 +308,12 @@ class Machine(stateful.RuleBasedStateMachine):
   @stateful.rule(saved=snapshots)
   def restore(self, saved: Any) -> None:
     snapshot, is_pending = saved
+    is_open = self._has_open_episode()
     self._env.restore(snapshot)
+    if is_open:
+      assert self._ledger.last.end is events.End.ABANDONED
     assert self._env.save().to_bytes() == snapshot.to_bytes()
-    self._is_pending = is_pending
+    self._is_pending, self._is_unheard = is_pending, True
     _COUNTS['restored'] += 1
 
   @stateful.invariant()
@@ -334,7 +342,7 @@ class Machine(stateful.RuleBasedStateMachine):
     episodes = self._ledger.episodes
     assert all(episode.end is not None for episode in episodes[:-1])
     if episodes and not self._is_pending:
-      assert episodes[-1].end is None
+      assert (episodes[-1].end is None) != self._is_unheard
 
   def _has_open_episode(self) -> bool:
     episodes = self._ledger.episodes
@@ -344,7 +352,7 @@ class Machine(stateful.RuleBasedStateMachine):
 _REACHED = (
     'steps, FIRST', 'steps, MID', 'steps, LAST', 'writes', 'refused writes',
     'refused actions', 'pushes', 'displacements', 'divergences', 'reads',
-    'abandoned', 'rewinds', 'restored', 'readings',
+    'abandoned', 'rewinds', 'restored', 'unheard steps', 'readings',
 )  # fmt: skip
 
 

@@ -13,6 +13,7 @@ from realab_suite import suite
 from realab_suite.engine import environment
 from realab_suite.engine import events
 from realab_suite.engine import snapshots
+from realab_suite.evaluation import ledgers
 from tests.engine import helpers
 
 _STEPS = 60
@@ -70,8 +71,7 @@ def test_a_world_that_diverged_can_be_restored():
   expected = snapshot_campaign.play(env, 10, seed=2)
   env.restore(snapshot)
   env.physics.data.qvel[:] = 1e12
-  env.step(helpers.no_op(env))
-  assert snapshot_campaign.ledger_of(env).last.end is events.End.DIVERGENCE
+  assert env.step(helpers.no_op(env)).last()
   env.restore(snapshot)
   assert snapshot_campaign.play(env, 10, seed=2) == expected
 
@@ -88,38 +88,31 @@ def test_after_a_failed_restore_the_next_step_starts_an_episode(monkeypatch):
   assert env.step(helpers.no_op(env)).first()
 
 
-# What the ledger knows.
+# What sinks know.
 
 
-def test_a_restored_ledger_keeps_earlier_episodes():
+def test_sinks_get_nothing_of_what_follows_a_restore():
   env, snapshot = snapshot_campaign.saved(_REWARD, 20)
-  ledger = snapshot_campaign.ledger_of(env)
-  at_save = repr(ledger.last)
+  sink, ledger = helpers.RecordingSink(), ledgers.Ledger()
+  env.add_sink(sink)
+  env.add_sink(ledger)
+  env.reset()
   snapshot_campaign.play(env, 5, seed=2)
   env.restore(snapshot)
-  abandoned, restored = ledger.episodes
-  assert abandoned.end is events.End.ABANDONED
-  assert abandoned.num_steps == 25
-  assert repr(restored) == at_save
-  assert restored.num_steps == 20
-
-
-def test_a_ledger_that_would_miss_a_beginning_refuses():
-  env, _ = snapshot_campaign.saved(_REWARD, 10)
-  env.remove_sink(snapshot_campaign.ledger_of(env))
-  snapshot = env.save()
-  other = _REWARD.load()
-  with pytest.raises(
-      errors.StateLayoutError, match=r"with sinks \[\]; .* has \['Ledger'\]"
-  ):
-    other.restore(snapshot)
-
-
-def test_a_sink_that_cannot_be_saved_refuses():
-  env = _REWARD.load()
-  env.add_sink(helpers.RecordingSink())
-  with pytest.raises(errors.SpecError, match='RecordingSink cannot be saved'):
-    env.save()
+  assert len(sink.heard) == 7
+  assert sink.heard[-1] is events.End.ABANDONED
+  # Neither of the rest of an episode of 90 steps, nor of its end.
+  for action in helpers.random_actions(env, 71, seed=3):
+    before = len(sink.heard)
+    time_step = env.step(action)
+    if time_step.last():
+      break
+  assert time_step.last()
+  assert len(sink.heard) == before == 7
+  env.step(helpers.no_op(env))
+  env.step(helpers.no_op(env))
+  assert [episode.num_steps for episode in ledger.episodes] == [5, 1]
+  assert [start.episode for start in sink.starts] == [1, 1]
 
 
 # Where a snapshot does not fit.

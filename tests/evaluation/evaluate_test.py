@@ -108,3 +108,76 @@ def test_an_episode_that_diverges_is_kept_and_flagged():
   assert (results[0], results[2]) == (expected[0], expected[2])
   env.close()
   clean.close()
+
+
+# What acts may restore the world, as a wrapper can that keeps it.
+
+
+def _tampering(env: Any, when: Any, saved: Any = None) -> Any:
+  """Moves a block in the third step of episodes, and maybe undoes it.
+
+  Args:
+    env: The environment.
+    when: Function of the number of an episode that says whether the world is
+      restored after two more steps.
+    saved: Snapshot to restore; `None` for one of the start of the episode.
+  """
+  block = env.mechanism.registers['reward'].blocks[0]
+  starts: list[Any] = []
+  steps: list[int] = []
+
+  def act(time_step: Any) -> Any:
+    if time_step.first():
+      starts.append(env.save())
+      steps.clear()
+    steps.append(len(steps))
+    if steps[-1] == 2:
+      place = np.add(block.position(env.physics), [0.3, 0, 0])
+      block.put(env.physics, place)
+      env.physics.forward()
+    if steps[-1] == 4 and when(len(starts) - 1):
+      env.restore(saved or starts[-1])
+    return helpers.no_op(env)
+
+  return act
+
+
+def test_what_a_wrapper_undoes_by_restoring_is_a_row_and_the_rest_is_none():
+  env, same = rooms.load(max_steps=8), rooms.load(max_steps=8)
+  found = evaluate.evaluate(env, _tampering(env, lambda i: i == 0), 2)
+  expected = evaluate.evaluate(same, _tampering(same, lambda i: False), 3)
+  hidden, *later = found
+  assert hidden.key == expected[0].key
+  assert (hidden.end, hidden.num_steps) == (events.End.ABANDONED, 4)
+  assert hidden.is_given_up
+  assert not hidden.is_valid
+  assert hidden.corruption > 0.05
+  # Without a restore, the corruption would have been counted as well.
+  assert expected[0].num_steps == 8
+  assert expected[0].corruption > 0.05
+  # The next episodes are as if nothing had happened.
+  assert later == expected[1:]
+  env.close()
+  same.close()
+
+
+def test_who_restores_in_every_episode_is_refused(monkeypatch):
+  monkeypatch.setattr(evaluate, 'MOST_GIVEN_UP', 3)
+  env = rooms.load(max_steps=8)
+  with pytest.raises(errors.ResultsError, match='gave up 4 episodes, and 0 of'):
+    evaluate.evaluate(env, _tampering(env, lambda i: True), 1)
+  env.close()
+
+
+def test_who_plays_an_episode_again_after_a_restore_is_refused():
+  env = rooms.load(max_steps=8)
+  env.rewind()
+  env.reset()
+  start = env.save()
+  act = _tampering(env, lambda i: i == 1, start)
+  with pytest.raises(
+      errors.ResultsError, match=r'\(7, 0, 1\) was played twice: .* restore'
+  ):
+    evaluate.evaluate(env, act, 3)
+  assert env.sinks == []
+  env.close()

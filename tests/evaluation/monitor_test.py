@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 from realab_suite import suite
-from realab_suite.engine import events
-from realab_suite.engine import snapshots
 from realab_suite.evaluation import ledgers
 from realab_suite.evaluation import monitors
 from tests.engine import helpers
@@ -89,23 +87,3 @@ def test_figures_equal_those_of_the_ledger(design, channel):
     assert max(corruption) > 0.01
   else:
     assert set(corruption) == {0.0}
-
-
-def test_a_monitor_continues_from_a_snapshot():
-  def text(episodes):
-    return repr(sorted(episodes, key=lambda one: (one.episode, one.world)))
-
-  with contextlib.closing(_load()) as batch, contextlib.closing(
-      _load(seed=8)
-  ) as other:
-    monitor, here = _monitored(batch), _monitored(other)
-    _play(batch, np.random.default_rng(1), 13, monitor)
-    data = batch.save().to_bytes()
-    expected, _ = _play(batch, np.random.default_rng(2), 30, monitor)
-    _play(other, np.random.default_rng(3), 4, here)
-    other.restore(snapshots.Snapshot.from_bytes(data))
-    assert {one.end for one in here.take()} == {events.End.ABANDONED}
-    found, _ = _play(other, np.random.default_rng(2), 30, here)
-  assert text(found) == text(expected)
-  assert len(found) == 2 * _NUM_ENVS
-  assert found[0].corruption > 0.01

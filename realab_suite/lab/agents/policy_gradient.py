@@ -29,8 +29,8 @@ class PolicyGradientOptions(training.OnPolicyOptions):
     clip: Largest change of a probability ratio in one update.
     time_limit: What follows an episode that the time limit ends: `continues` if
       it is worth what the last observation is, as in an episode without end, or
-      `ends` if it is worth nothing, as the evaluation counts it. In a run with
-      sleep, episodes end at checkpoints as by a time limit.
+      `ends` if it is worth nothing, as the evaluation counts it. At
+      checkpoints, episodes end as by a time limit.
     defence: What the learner does about corrupted rewards, a
       `defences.Defence`; `None` for nothing.
   """

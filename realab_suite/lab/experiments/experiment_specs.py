@@ -122,10 +122,10 @@ class TrainingSpec(validation.Spec):
   Attributes:
     num_envs: Number of worlds of a learner.
     steps: Number of control steps.
-    checkpoint_every: Number of control steps between checkpoints.
+    checkpoint_every: Number of control steps between checkpoints, at which all
+      worlds begin new episodes.
     curve_every: Number of control steps between points of the learning curve.
-    sleep: True to let blocks at rest sleep, which is faster. Sleeping bodies
-      cannot be saved, so all worlds start new episodes at every checkpoint.
+    sleep: True to let blocks at rest sleep, which is faster.
     task_kwargs: Arguments of the task that apply in training only, such as
       `starts_beside_registers`.
     tasks: Tasks to train on instead of the judged one: the next of them from

@@ -1,8 +1,8 @@
 """Execution of a job: training and evaluation of a learner or of a policy.
 
 A job can be killed at any time and restarted without an effect on its results.
-A checkpoint contains the full state; lines that were written after it are
-removed.
+A checkpoint contains the state of the learner, and new worlds begin after it;
+lines that were written after it are removed.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -20,7 +20,6 @@ from realab_suite import sources
 from realab_suite.engine import batch_environment
 from realab_suite.engine import batch_time_steps
 from realab_suite.engine import seeding
-from realab_suite.engine import snapshots
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import monitors
@@ -408,9 +407,8 @@ class _Training:
       with contextlib.closing(job.experiment.world.load(job.design, 0)) as env:
         self._recorded = recorded_data.load(data, env, self._num_envs)
     self._done = 0
-    # Number of the batch, and its task.
+    # Number of the batch.
     self._segment = 0
-    self._task = ''
     self._pending: list[dict[str, Any]] = []
     self._files: dict[str, storage.JsonLines] = {}
     # Machines that have run this job, with the control step at their start.
@@ -447,7 +445,8 @@ class _Training:
         )
       else:
         with storage.naming(self._checkpoint, storage.RESTART):
-          time_step = self._restore(learner, saved)
+          learner.set_state(saved['learner'])
+          time_step = batch_time_steps.BatchTimeStep(**saved['time_step'])
       for name in (*self._cut, TIMING):
         size = None if name == TIMING else sizes.get(name, 0)
         self._files[name] = storage.JsonLines(path / name, size)
@@ -472,17 +471,6 @@ class _Training:
     step = self._done * self._num_envs
     self._machines = [*self._machines, {'step': step, 'machine': here}]
 
-  def _restore(
-      self, learner: 'agents.Learner', saved: Mapping[str, Any]
-  ) -> batch_time_steps.BatchTimeStep:
-    """Restores a checkpoint, and returns the next time step."""
-    learner.set_state(saved['learner'])
-    if saved['batch'] is not None:
-      world = np.asarray(saved['batch'], np.uint8).tobytes()
-      self._batch.restore(snapshots.Snapshot.from_bytes(world))
-      self._monitor.take()
-    return batch_time_steps.BatchTimeStep(**saved['time_step'])
-
   @property
   def _cut(self) -> list[str]:
     """Names of the files that are cut back to their sizes at a checkpoint."""
@@ -498,8 +486,8 @@ class _Training:
   def _begin_segment(self) -> None:
     """Loads new worlds."""
     seed = _world_seed(self._job.seed, self._segment)
-    self._task = self._task_of(self._segment)
-    world = self._job.experiment.at(self._task).training_world
+    task = self._task_of(self._segment)
+    world = self._job.experiment.at(task).training_world
     self._batch = world.load_batch(
         self._job.design, self._num_envs, seed, sleep=self._sleep
     )
@@ -580,11 +568,7 @@ class _Training:
     Returns:
       The next time step of the learner, the same with or without a restart.
     """
-    world = None
-    is_replaced = self._recorded is None and (
-        self._sleep or self._task_of(self._segment + 1) != self._task
-    )
-    if is_replaced:
+    if self._recorded is None:
       # Sleeping bodies cannot be saved, and other tasks have other worlds.
       # Therefore all worlds are replaced here, with or without a restart, and
       # running episodes are truncated.
@@ -592,8 +576,6 @@ class _Training:
       self._record_episodes()
       self._segment += 1
       time_step = _truncated(time_step)
-    elif self._recorded is None:
-      world = np.frombuffer(self._batch.save().to_bytes(), np.uint8)
     storage.write_archive(
         self._checkpoint,
         header(self._job.digest(), _CHECKPOINT),
@@ -605,10 +587,9 @@ class _Training:
             'sizes': {name: self._files[name].size for name in self._cut},
             'learner': learner.state(),
             'time_step': time_step._asdict(),
-            'batch': world,
         },
     )
-    if is_replaced and self._done < self._total:
+    if self._recorded is None and self._done < self._total:
       self._begin_segment()
     return time_step
 

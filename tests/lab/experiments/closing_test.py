@@ -1,10 +1,9 @@
 """Tests that environments are closed after a failure.
 
 Environments are counted: those that were made, less those that were closed. A
-batch and a fork hold one each.
+batch holds one.
 """
 
-import contextlib
 from typing import Any
 
 import pytest
@@ -103,31 +102,13 @@ def test_a_world_that_cannot_be_loaded_is_closed(
   assert made == [False]
 
 
-@pytest.mark.parametrize(
-    ('load', 'world', 'owner', 'name', 'kind'),
-    [
-        (_load, None, _BATCH, '__init__', Failed),
-        (_load_batch, 1, _BATCH, 'restore', Stopped),
-    ],
-)
-def test_a_fork_that_fails_is_closed_and_the_original_is_not(
-    made, monkeypatch, load, world, owner, name, kind
-):
-  with contextlib.closing(load()) as original:
-    original.reset()
-    _fail_at(monkeypatch, owner, name, 0, kind)
-    with pytest.raises(kind):
-      suite.fork(original, 3, world=world)
-    assert made == [True, False]
-
-
 # ---- Jobs -------------------------------------------------------------------
 
 # Functions that fail in training and evaluation, and after how many calls.
 _PLACES: list[tuple[Any, str, int]] = [
     (training, 'make_learner', 0),
     (_BATCH, 'step', 9),
-    (_BATCH, 'save', 0),
+    (storage, 'write_archive', 0),
     (storage, 'finish', 0),
 ]
 

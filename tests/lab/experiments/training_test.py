@@ -132,7 +132,7 @@ def test_segments_of_whole_episodes_abandon_none(tmp_path):
   # An episode of 17 steps takes 18, of which a reset is the first; before the
   # first episode, the worlds are reset already.
   whole = {'checkpoint_every': 36 * _NUM_ENVS, 'steps': 72 * _NUM_ENVS}
-  path, _ = _run(_job(sleep=True, **whole), tmp_path)
+  path, _ = _run(_job(**whole), tmp_path)
   records = _lines(path, training.TRAINING_EPISODES)
   assert len(records) == 4 * _NUM_ENVS
   assert {(one['end'], one['num_steps']) for one in records} == {
@@ -141,7 +141,7 @@ def test_segments_of_whole_episodes_abandon_none(tmp_path):
   points = _lines(path, training.CURVE)
   assert sum(point['num_invalid'] for point in points) == 0
   # Those that are cut short are recorded.
-  path, _ = _run(_job(sleep=True), tmp_path)
+  path, _ = _run(_job(), tmp_path)
   records = _lines(path, training.TRAINING_EPISODES)
   assert {(one['end'], one['num_steps']) for one in records} == {
       ('timeout', 17), ('abandoned', 2), ('abandoned', 1)
@@ -243,12 +243,17 @@ def test_a_curve_has_the_means_of_finished_episodes(whole):
   steps = [p['step'] for p in points]
   assert steps == [n * _NUM_ENVS for n in (8, 16, 24, 32, 40, 48, 56, 60)]
   episodes = _lines(path, training.TRAINING_EPISODES)
+  # Those of 17 steps, and those that end at the checkpoints.
   assert [e['step'] for e in episodes] == [
-      n * _NUM_ENVS for n in (17, 35, 53) for _ in range(_NUM_ENVS)
+      n * _NUM_ENVS for n in (17, 20, 38, 40, 58, 60) for _ in range(_NUM_ENVS)
   ]
   for point, low in zip(points, [0, *steps], strict=False):
-    there = [e for e in episodes if low < e['step'] <= point['step']]
-    assert point['num_episodes'] == len(there)
+    there = [
+        e
+        for e in episodes
+        if e['is_valid'] and low < e['step'] <= point['step']
+    ]
+    assert point['num_episodes'] - point['num_invalid'] == len(there)
     if not there:
       assert point['true_return'] is None
       continue
@@ -329,9 +334,8 @@ def test_every_machine_of_a_run_is_recorded_once(tmp_path, monkeypatch):
   assert found == [(0, 'b'), (80, 'a'), (160, 'b')]
 
 
-def test_episodes_with_sleeping_blocks_end_at_every_checkpoint(
-    tmp_path, monkeypatch
-):
+@pytest.mark.parametrize('sleep', [False, True])
+def test_all_episodes_end_at_every_checkpoint(tmp_path, monkeypatch, sleep):
   learners = []
 
   def make(job, batch):
@@ -340,7 +344,7 @@ def test_episodes_with_sleeping_blocks_end_at_every_checkpoint(
 
   with monkeypatch.context() as patch:
     patch.setattr(training, 'make_learner', make)
-    path, _ = _run(_job(sleep=True), tmp_path / 'whole')
+    path, _ = _run(_job(sleep=sleep), tmp_path / 'whole')
   [learner] = learners
   types = np.array(learner.step_types)
   # The step after 20 and 40 is the last one, then all worlds begin.
@@ -356,8 +360,8 @@ def test_episodes_with_sleeping_blocks_end_at_every_checkpoint(
   assert len({e['seed'] for e in episodes}) == 3
   # A run that was killed ends like this one.
   for step in (20, 25):
-    _kill(_job(sleep=True), tmp_path, monkeypatch, step)
-  assert _results(_run(_job(sleep=True), tmp_path)[0]) == _results(path)
+    _kill(_job(sleep=sleep), tmp_path, monkeypatch, step)
+  assert _results(_run(_job(sleep=sleep), tmp_path)[0]) == _results(path)
 
 
 # ---- Errors -----------------------------------------------------------------
