@@ -43,8 +43,11 @@ from tests import patience
 _COMMAND = ('-m', 'realab_suite.launchers.sweep')
 _NUM_KILLS = 20
 _STEPS = 8_000
-# Files with times, of the processes themselves, and for continuing.
-_NOT_COMPARED = {training.TIMING, 'lock', scheduler.LOGS, storage.CHECKPOINT}
+# Files with times, of the processes themselves, and for continuing; compiled
+# functions, whose names depend on the folder.
+_NOT_COMPARED = {
+    training.TIMING, 'lock', scheduler.LOGS, storage.CHECKPOINT, 'compiled',
+}  # fmt: skip
 
 
 def _experiment(scale: float, seed: int) -> dict[str, Any]:
