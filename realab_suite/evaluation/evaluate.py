@@ -116,7 +116,7 @@ def results_of(
     ResultsError: If `num_episodes` is not a positive integer, or
       `first_episode` not one from 0; if more than `MOST_GIVEN_UP` times
       `num_episodes` are given up; or if an episode does not end, leaves no
-      result, or is played again.
+      result, or is played again or in another world.
   """
   num_episodes = integers.check(
       'num_episodes', num_episodes, 1, error=errors.ResultsError
@@ -128,6 +128,7 @@ def results_of(
   added: list[events.EventSink] = []
   ended: list[results.EpisodeResult] = []
   played: set[tuple[int, int, int]] = set()
+  place = env.seed, env.world
   try:
     for sink in (monitor, *sinks):
       env.add_sink(sink)
@@ -142,10 +143,11 @@ def results_of(
         for result in monitor.take():
           if num_places == num_episodes:
             return ended
-          if result.key in played:
+          if result.key in played or result.key[:2] != place:
             raise errors.ResultsError(
-                f'(seed, world, episode) {result.key} was played twice: what'
-                ' acts must neither restore nor rewind the world'
+                f'(seed, world, episode) {result.key} was played twice, or is'
+                f' not of (seed, world) {place}: what acts must neither restore'
+                ' nor rewind the world'
             )
           played.add(result.key)
           ended.append(result)

@@ -176,8 +176,20 @@ def test_who_plays_an_episode_again_after_a_restore_is_refused():
   start = env.save()
   act = _tampering(env, lambda i: i == 1, start)
   with pytest.raises(
-      errors.ResultsError, match=r'\(7, 0, 1\) was played twice: .* restore'
+      errors.ResultsError, match=r'\(7, 0, 1\) was played twice, .* restore'
   ):
     evaluate.evaluate(env, act, 3)
   assert env.sinks == []
   env.close()
+
+
+def test_who_restores_a_world_of_another_seed_is_refused():
+  env, other = rooms.load(max_steps=8), rooms.load(max_steps=8, seed=99)
+  other.reset()
+  act = _tampering(env, lambda i: i == 1, other.save())
+  with pytest.raises(
+      errors.ResultsError, match=r'\(99, 0, \d\) was .* not of .* \(7, 0\)'
+  ):
+    evaluate.evaluate(env, act, 3)
+  env.close()
+  other.close()
