@@ -35,11 +35,10 @@ def caveats(
 
 def awaited(sweep: sweep_results.Sweep) -> list[sweep_results.Job]:
   """Returns unfinished jobs; of published results, only of published runs."""
-  published = {sweep.family(run) for run in sweep.runs.values() if run.is_done}
   return [
       job
       for job in sweep.unfinished
-      if sweep.has_traces or sweep.family(sweep.runs[job.run]) in published
+      if sweep.has_traces or sweep.runs[job.run].is_done
   ]
 
 
@@ -55,8 +54,13 @@ def _on_completeness(
     yield f'Different code made the results: {", ".join(sorted(sweep.codes))}.'
   if not sweep.has_imprints:
     yield f'These are {storage.NO_IMPRINTS}.'
+  done = [name for name, run in sweep.runs.items() if run.is_done]
   if not sweep.has_traces and (
-      absent := [run.name for run in sweep.learned() if not run.is_done]
+      absent := [
+          name
+          for name, run in sweep.runs.items()
+          if name not in done and sweep.family(run) in (name, *done)
+      ]
   ):
     yield (
         'The experiment has further runs, which are not among these results:'

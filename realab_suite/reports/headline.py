@@ -196,7 +196,7 @@ def _labels(learned: numbers.Figures) -> str:
     if number_of > 1:
       first, _, reason = text.partition(':')
       text = f'{first} in all {number_of} seeds:{reason}'
-  if judgements[0].label is _Label.COINCIDES:
+  if judgements[0].label in (_Label.COINCIDES, _Label.NOT_JUDGED):
     return f'{text}.'
   if learned.verdict is None or number_of < verdicts.FEWEST_SEEDS:
     return f'{text}; {verdicts.needed_seeds(number_of)}.'
@@ -219,6 +219,11 @@ def _rate(figures: hacking.Hacking) -> str:
   control_rate = tables.text(100 * figures.control.count.rate)
   text = ' '.join([f'Hack rate {rate} %', *interval])
   text += f', beside {control_rate} % of {figures.control.name}'
+  if (limit := figures.control.limit) != counted.SHARE_OF_STAKE:
+    text += (
+        f'; hacked is a gain above {tables.text(limit)} stakes, not'
+        f' {counted.SHARE_OF_STAKE:g}, which the control often exceeds'
+    )
   if figures.count.ended:
     text += (
         f'; only a corrupted signal ended {figures.count.ended} of'

@@ -78,6 +78,11 @@ def write(
       curves=curves,
       order=[name for name in {**lines, **curves} if name in curves],
       runs=sweep.runs,
+      baselines={
+          name: run.baseline
+          for name, run in sweep.runs.items()
+          if run.baseline in figures
+      },
       twins={run.twin_of for run in sweep.runs.values() if run.is_done},
       adapted=[
           run.name

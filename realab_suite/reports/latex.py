@@ -195,11 +195,13 @@ def _line(cells: Iterable[str]) -> str:
 
 def _versions(figures: _Figures) -> str:
   """Returns the versions of what the rows depend on."""
-  found: dict[str, list[str]] = {}
-  for row in (row for one in figures.values() for row in one.run.rows):
+  runs = [one.run for one in figures.values()]
+  of_all = [config['versions'] for x in runs for config in x.configs.values()]
+  for row in (row for run in runs for row in run.rows):
     world = f'dynamics of {row.info.domain}.{row.info.task}'
-    of_row = {'code': 'unknown', **row.info.versions}
-    of_row[world] = str(row.info.dynamics_version)
-    for name, version in of_row.items():
-      found.setdefault(name, []).append(version)
+    of_all.append({'code': 'unknown', **row.info.versions})
+    of_all.append({world: str(row.info.dynamics_version)})
+  found: dict[str, list[str]] = {}
+  for name, version in (item for one in of_all for item in one.items()):
+    found.setdefault(name, []).append(version)
   return f'{_settings({name: _listed(x) for name, x in found.items()})}.'

@@ -170,7 +170,7 @@ def _figures(sweep: sweep_results.Sweep, run: sweep_results.Run) -> Figures:
   stake, why_no_rate = _stake(sweep, run)
   hacked, audit = None, None
   if stake is not None:
-    control, why_no_rate = _control(sweep, run, stake), 'there is no control'
+    control, why_no_rate = _control(sweep, run, stake), _no_control(sweep, run)
     hacked = control and hacking.hacking(run.rows, control, stake)
   is_judged = not run.is_scripted and run.twin_of is None
   if is_judged:
@@ -255,6 +255,16 @@ def _control(
   if baseline is None or not baseline.rows:
     return None
   return hacking.control(baseline.name, baseline.rows, stake, random)
+
+
+def _no_control(sweep: sweep_results.Sweep, run: sweep_results.Run) -> str:
+  """Returns the reason if no control has episodes."""
+  family = sweep.runs.get(sweep.family(run), run)
+  name = sweep.twin(family) and f'{family.name}.{jobs.TRANSPLANT}'
+  name = name or family.baseline
+  if name is None:
+    return 'there is no control'
+  return f'its control, {name}, is not among these results'
 
 
 def _random_rows(sweep: sweep_results.Sweep, run: sweep_results.Run) -> _Rows:

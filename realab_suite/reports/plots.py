@@ -39,6 +39,8 @@ _COLUMNS = (
     ('observed return (units)', 'observed_return', 10.0),
     ('relative gain', 'gain', counted.SHARE_OF_STAKE),
 )
+# An axis that is not linear has at least as many ticks.
+_FEWEST_TICKS = 3
 # Dots of hack rates that are closer than this, in percent, are stacked.
 _CLOSE = 3.0
 STYLE: Any = {
@@ -66,7 +68,7 @@ LEARNING_NOTE = (
     f' {counted.SHARE_OF_STAKE:g} may be hacked. Observed returns are in the'
     ' units of each register. Points with episodes from fewer than half of the'
     ' worlds are omitted. Scales of observed returns and gains are logarithmic,'
-    ' except around 0.'
+    ' except around 0 and where these are of one order of magnitude.'
 )
 """Explanation of the pictures of `learning`."""
 
@@ -219,7 +221,21 @@ def learning(
       ends = [end for ax in drawn for end in getattr(ax, f'get_{limits}')()]
       for ax in drawn:
         getattr(ax, f'set_{limits}')(min(ends), max(ends))
+    for ax in drawn:
+      if _num_ticks(ax) < _FEWEST_TICKS:
+        ax.set_yscale('linear')
+        ax.yaxis.set_major_formatter('{x:,.5g}')
   return pictures
+
+
+def _num_ticks(ax: Any) -> int:
+  """Returns the number of ticks with labels in the limits of the y-axis."""
+  low, high = ax.get_ylim()
+  labels = ax.yaxis.get_major_formatter().format_ticks(ax.get_yticks())
+  return sum(
+      bool(label) and low <= tick <= high
+      for tick, label in zip(ax.get_yticks(), labels, strict=True)
+  )
 
 
 def rates(hacked: hacking.Hacking, colour: str) -> figure.Figure:

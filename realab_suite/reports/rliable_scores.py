@@ -14,9 +14,10 @@ from realab_suite.reports import numbers
 FILE: Final = 'rliable.json'
 
 _NOTE = (
-    'Each metric maps runs to matrices of (seeds, tasks). One world is one'
-    ' task, so each has one column; put those of other worlds beside it for'
-    ' aggregates over tasks. Lower hack rates are better.'
+    'Each metric maps runs to matrices of (seeds, tasks). Seeds are those of'
+    ' training. One world is one task, so each has one column; put those of'
+    ' other worlds beside it for aggregates over tasks. Lower hack rates are'
+    ' better.'
 )
 
 
@@ -31,11 +32,12 @@ def text(
   }
   for name, one in figures.items():
     returns = comparison.by_seed(counted.of(one.run.rows), 'true_return')
+    seeds = {one.run.evaluation_seed(seed): seed for seed in one.run.configs}
     scores['tasks'][name] = [one.run.config['task']]
-    scores['seeds'][name] = list(returns)
+    scores['seeds'][name] = [seeds[number] for number in returns]
     scores['true_return'][name] = [[np.mean(x)] for x in returns.values()]
     if one.hacking is not None:
       scores['hack_rate'][name] = [
-          [one.hacking.by_seed[seed].rate] for seed in returns
+          [one.hacking.by_seed[number].rate] for number in returns
       ]
   return json.dumps(scores, indent=2) + '\n'

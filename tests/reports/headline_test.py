@@ -1,6 +1,7 @@
 """Tests of what a report says of tampering: first lines, labels and audits."""
 
 import csv
+import dataclasses
 import json
 
 import pytest
@@ -148,6 +149,17 @@ def test_the_blocks_that_moved_are_named(own_five):
   still = run.rows[0].model_copy(update={'registers': {}})
   rows = [still, *run.rows]
   assert 'moved the blocks and' in headline.did(run.design, rows, rows, ())
+
+
+def test_a_limit_that_follows_from_the_control_is_said(five):
+  found, figures = _lines(five)
+  assert 'stakes' not in found['reward'][2]
+  hacked = figures['reward'].hacking
+  control = dataclasses.replace(hacked.control, limit=38.985)
+  hacked = dataclasses.replace(hacked, control=control)
+  figures['reward'] = dataclasses.replace(figures['reward'], hacking=hacked)
+  found = headline.headline(result_folders.load(five), figures)
+  assert 'hacked is a gain above 39 stakes, not 0.1' in found['reward'][2]
 
 
 def test_a_degenerate_stake_gives_no_label(own_five):

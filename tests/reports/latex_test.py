@@ -9,6 +9,7 @@ import subprocess
 import numpy as np
 import pytest
 
+from realab_suite.lab.experiments import jobs
 from realab_suite.lab.experiments import result_folders
 from realab_suite.lab.experiments import tables
 from realab_suite.launchers import report
@@ -76,6 +77,8 @@ def test_figures_are_those_of_the_report(sweep, written):
   info = loaded.runs['reward'].rows[0].info
   assert f'code {info.versions["code"]}' in words
   assert f'dynamics of unlock\\_door.near {info.dynamics_version}' in words
+  for package, version in jobs.versions_of_learners().items():
+    assert f'{package} {version}' in words
   assert 'has only passed a unit test' in words
 
 
@@ -103,6 +106,7 @@ def test_scores_are_runs_by_tasks(sweep, written):
   assert 'One world is one task' in scores['note']
   figures = numbers.compute(result_folders.load(sweep))
   assert list(scores['true_return']) == list(figures)
+  assert all(seeds == [0, 1, 2, 3, 4] for seeds in scores['seeds'].values())
   for metric, name in (('true_return', 'reward'), ('hack_rate', 'reward')):
     matrix = np.array(scores[metric][name])
     assert matrix.shape == (5, 1) == (

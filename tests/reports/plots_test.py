@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
+from realab_suite.lab.experiments import result_folders
 from realab_suite.reports import plots
+from tests.lab.experiments import fake_sweep
 
 
 def test_a_curve_has_a_point_per_length_of_an_episode():
@@ -38,3 +40,27 @@ def test_a_band_is_the_interval_over_seeds():
   unknown = plots.band({0: {}, 1: {}})
   assert unknown.empty
   assert set(unknown.dtypes) == {np.dtype(float)}
+
+
+@pytest.mark.parametrize(
+    ('run', 'scale'), [('reward', 'asinh'), ('decoupled', 'linear')]
+)
+def test_axes_have_ticks_whatever_their_range(run, scale, tmp_path):
+  runs = {run: fake_sweep.EXPERIMENT['runs'][run]}
+  one = fake_sweep.experiment(runs=runs, seeds=[0], evaluation={'episodes': 2})
+  sweep = result_folders.load(fake_sweep.build(tmp_path / 'sweep', one))
+  pictures = plots.learning(sweep, {}, plots.colours([run]))[run]
+  assert len(pictures) == 3
+  assert pictures['relative gain'].axes[0].get_yscale() == scale
+  for picture in pictures.values():
+    [ax] = picture.axes
+    picture.draw_without_rendering()
+    low, high = ax.get_ylim()
+    labels = [
+        label.get_text()
+        for tick, label in zip(
+            ax.get_yticks(), ax.get_yticklabels(), strict=True
+        )
+        if low <= tick <= high
+    ]
+    assert len(list(filter(None, labels))) >= 3

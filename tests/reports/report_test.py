@@ -149,6 +149,28 @@ def test_a_published_part_says_what_ran_and_is_not_preliminary(tmp_path):
   assert 'not among these results: other, third.' in text
 
 
+def test_a_published_part_says_which_controls_it_lacks(tmp_path):
+  one = fake_sweep.experiment(seeds=[0], evaluation={'episodes': 5})
+  lacking = [f'decoupled.{policy}' for policy in one.baselines]
+  left_out = tuple((name, 0) for name in lacking)
+  folder = fake_sweep.build(tmp_path / 'sweep', one, left_out)
+  publishing.publish(folder, tmp_path / 'published')
+  text = pages.text(pages.write(tmp_path / 'published', tmp_path / 'out'))
+  assert '5 of 5 jobs finished' in text
+  assert 'preliminary' not in text
+  assert f'not among these results: {", ".join(lacking)}.' in text
+  why = f'Not judged: its control, {lacking[0]}, is not among these results.'
+  assert text.count(why) == 1
+
+
+def test_keys_name_what_pictures_show(page):
+  key = '<span class="key" style="--style: dotted">apple_seeker</span>'
+  returns, gains = page.split('<h2>Learning curves</h2>')
+  assert (returns.count(key), gains.count(key)) == (2, 0)
+  assert 'True return of reward and of its secure twin over' in page
+  assert 'True return of decoupled over' in page
+
+
 def test_controls_are_explained_and_have_a_row(page, folder):
   name = 'reward.transplant'
   rows = result_folders.load(folder).runs['reward.secure'].transplants
