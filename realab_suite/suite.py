@@ -227,6 +227,20 @@ def load(
         f'visualize_reward={messages.quote(visualize_reward)} would show the'
         ' true reward to the agent; must be False'
     )
+  return _single(
+      domain_name, task_name, task_kwargs, environment_kwargs, design, overrides
+  )
+
+
+def _single(
+    domain_name: str,
+    task_name: str | None,
+    task_kwargs: Mapping[str, Any] | None,
+    environment_kwargs: Mapping[str, Any] | None,
+    design: specs.Design | Omitted | None,
+    overrides: Sequence[str],
+) -> environment.Environment:
+  """Returns the environment of `load`, for the function that users call."""
   domain_name, task_name = _names(domain_name, task_name)
   kwargs = _keywords('task_kwargs', task_kwargs)
   random = kwargs.pop('random', None)
@@ -256,7 +270,7 @@ def load(
     warnings.warn(
         f'{domain_name}.{task_name} is loaded without feedback, because no'
         f' design is given, and {design.value} does not fit: {error}',
-        stacklevel=2,
+        stacklevel=3,
     )
     return env
 
@@ -345,13 +359,8 @@ def load_batch(
   num_envs = arguments.num_envs(num_envs)
   num_threads = arguments.num_threads(num_threads)
   sleep = arguments.flag('sleep', sleep)
-  single = load(
-      domain_name,
-      task_name,
-      task_kwargs,
-      environment_kwargs,
-      design=design,
-      overrides=overrides,
+  single = _single(
+      domain_name, task_name, task_kwargs, environment_kwargs, design, overrides
   )
   # Programs with one world need no batches.
   from realab_suite.engine import batch_environment

@@ -24,22 +24,37 @@ _Range = measurements.Range
 _BELOW, _IN_ALL = 0.4, 2.0
 
 
-def read_range(data: Any) -> tuple[Any, bool]:
-  """Returns the data of a register with plain ends, and whether it states them.
+def read_open(data: Any) -> tuple[Any, set[str]]:
+  """Returns the data of a register with plain values, and what was open in it.
 
   Args:
-    data: Data whose range may be `{usual: [low, high]}`.
+    data: Data whose range may be `{usual: [low, high]}`, and its scale
+      `{usual: scale}`.
+
+  Raises:
+    ValueError: If one of them is another mapping.
   """
-  given = data.get('range') if isinstance(data, Mapping) else None
-  if not isinstance(given, Mapping) or USUAL not in given:
-    return data, True
-  ends: Any = given[USUAL]
-  # An override of one end states both.
-  if loading.is_list(ends) and given.keys() <= {USUAL, '0', '1'}:
-    ends = [given.get(str(i), end) for i, end in enumerate(ends)]
-  else:
-    ends = given
-  return {**data, 'range': ends}, len(given) > 1
+  is_open = set()
+  for name, form in (('range', '[low, high]'), ('scale', 'scale')):
+    given = data.get(name) if isinstance(data, Mapping) else None
+    if not isinstance(given, Mapping):
+      continue
+    usual: Any = given.get(USUAL)
+    is_list = loading.is_list(usual)
+    # An override of one end states both.
+    ends = {'0', '1'} if is_list else set()
+    is_form = usual is not None and given.keys() <= {USUAL, *ends}
+    if not is_form or is_list != (name == 'range'):
+      raise ValueError(
+          f'{name}: {messages.quote(given)}; must be {form} or'
+          f' {{{USUAL}: {form}}}'
+      )
+    if is_list:
+      usual = [given.get(str(i), end) for i, end in enumerate(usual)]
+    if len(given) == 1:
+      is_open.add(name)
+    data = {**data, name: usual}
+  return data, is_open
 
 
 def holds(available: _Range, needed: _Range) -> bool:
@@ -99,6 +114,9 @@ def _change(
       continue
     ends = [0.0, spec.constant_initial, *(end for one in needed for end in one)]
     low, high = round(float(min(ends)), 9), round(float(max(ends)), 9)
+    if 'scale' in spec.model_fields_set:
+      changed[name] = (low, high), spec.scale
+      continue
     scale = min(_BELOW / max(-low, 1e-9), _IN_ALL / (high - low))
     if 0 < scale < spec.scale:
       unit = 10.0 ** (math.floor(math.log10(scale)) - 1)

@@ -76,7 +76,7 @@ class RegisterSpec(arguments.Arguments):
   register has those of the design.
 
   A range `{usual: [low, high]}` is not stated: it gives way to what a world
-  declares; see `DesignSpec.fitted`.
+  declares, and with it a scale `{usual: scale}`; see `DesignSpec.fitted`.
 
   Attributes:
     kind: Name of a registered register kind.
@@ -108,12 +108,11 @@ class RegisterSpec(arguments.Arguments):
 
   @pydantic.model_validator(mode='wrap')
   @classmethod
-  def _usual_range(cls, data: Any, handler: Any) -> 'RegisterSpec':
-    """Accepts `{usual: [low, high]}` for a range that is not stated."""
-    data, is_stated = fitting.read_range(data)
+  def _usual(cls, data: Any, handler: Any) -> 'RegisterSpec':
+    """Accepts `{usual: ...}` for a range or a scale that is not stated."""
+    data, is_open = fitting.read_open(data)
     made: RegisterSpec = handler(data)
-    if not is_stated:
-      made.model_fields_set.discard('range')
+    made.model_fields_set.difference_update(is_open)
     return made
 
   @pydantic.field_validator('place', mode='before')
@@ -409,8 +408,10 @@ class DesignSpec(validation.Spec):
       return self
     data = self.to_source()
     for name, (ends, scale) in changes.items():
-      open_range = {fitting.USUAL: [*ends]}
-      data['registers'][name] |= {'range': open_range, 'scale': scale}
+      source = data['registers'][name]
+      source['range'] = {fitting.USUAL: [*ends]}
+      if 'scale' not in self.registers[name].model_fields_set:
+        source['scale'] = {fitting.USUAL: scale}
     where = f'design {self.name!r}, with the ranges that this world needs'
     return validation.validate(DesignSpec, data, where)
 
@@ -425,8 +426,8 @@ class DesignSpec(validation.Spec):
       source = data['registers'][name]
       if 'initial' not in spec.model_fields_set:
         del source['initial']
-      if 'range' not in spec.model_fields_set:
-        source['range'] = {fitting.USUAL: source['range']}
+      for key in {'range', 'scale'} - spec.model_fields_set:
+        source[key] = {fitting.USUAL: source[key]}
     return data
 
   def channel_of(self, name: str) -> arguments.Channel:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import yaml
 
+from realab_suite import errors
 from realab_suite import policies
 from realab_suite import suite
 from realab_suite.evaluation import evaluate
@@ -70,6 +71,47 @@ def test_a_range_without_room_is_refused(declared: Any):
   text = refusals.refusal(specs.load(_REWARD).fitted, {'score': declared})
   assert text.startswith(f"design '{_REWARD}', with the ranges that this world")
   assert 'registers.' in text
+
+
+@pytest.mark.parametrize(
+    ('scale', 'fitted'),
+    [('0.1', 0.1), ('0.001', 0.001), ('{usual: 0.1}', 0.04)],
+)
+def test_a_stated_scale_stays(scale: str, fitted: float):
+  design = specs.load(_REWARD, [f'registers.score.scale={scale}'])
+  for one in (design, specs.load(design, ['dof=planar'])):
+    score = one.fitted({'score': (-10, 5)}).registers['score']
+    assert (score.range, score.scale) == ((-10, 5), fitted)
+
+
+@pytest.mark.parametrize(
+    ('override', 'form'),
+    [
+        ('range={usul: [0, 20]}', '[low, high]'),
+        ('range={usual: 20}', '[low, high]'),
+        ('range={usual: [0, 20], low: 3}', '[low, high]'),
+        ('scale={usul: 1}', 'scale'),
+        ('scale={usual: [1]}', 'scale'),
+        ('scale={}', 'scale'),
+    ],
+)
+def test_an_open_value_has_one_form(override: str, form: str):
+  override = f'registers.score.{override}'
+  said = refusals.refusal(specs.load, _REWARD, [override])
+  assert said.startswith(f'override {override!r}: registers.score: ')
+  assert said.endswith(f'; must be {form} or {{usual: {form}}}')
+
+
+def test_only_what_the_world_writes_has_to_fit_a_stated_range():
+  world = 'unlock_door.near'
+  for name in ('reward', 'score'):
+    override = f'registers.{name}.range=[0, 1]'
+    with contextlib.ExitStack() as stack:
+      if name == 'score':
+        stack.enter_context(pytest.raises(errors.SpecError, match='contain'))
+      env = suite.load(world, design=_REWARD, overrides=[override])
+      stack.callback(env.close)
+      assert env.mechanism.registers[name].value_range == (0, 1)
 
 
 def test_feedback_follows_the_meters_that_it_is_computed_from():
