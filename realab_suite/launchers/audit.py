@@ -30,12 +30,18 @@ from realab_suite.launchers import renderers
 
 _SUBJECT = (*flags.WORLD, flags.TARGET)
 flags.take(*_SUBJECT, flags.EXPERIMENT, flags.RUN)
-flags.take(flags.IMPORT, flags.OUTPUT, flags.SEED, flags.BUDGET)
+flags.take(flags.IMPORT, flags.OUTPUT, flags.SEED)
+flags.take(
+    flags.BUDGET,
+    help_text='Largest number of episodes of the search. Default: 1200, or more'
+    ' if the design has many registers.',
+)
 _FILM = absl_flags.DEFINE_boolean(
     'film', True, 'Films an exploit that was found.'
 )
 
 REPORT = 'audit.json'
+_BUDGETS = absl_flags.IntegerParser(10, 1_000_000)
 _FILM_NAME = 'exploit.mp4'
 # Exit statuses; Python uses 1 for exceptions.
 _EXPLOITABLE = 3
@@ -45,11 +51,7 @@ _UNDECIDED = 5
 
 def main() -> int:
   """Runs the audit that the flags describe, and returns the exit status."""
-  has_film, budget = _has_film(), flags.BUDGET.value
-  if isinstance(budget, str):
-    raise errors.SpecError(
-        f'--budget={budget:.80}: must be a number of episodes, from 10'
-    )
+  has_film, budget = _has_film(), _budget()
   if not has_film:
     renderers.render_on_demand()
   # Imports dm_control, so a renderer has to be chosen first.
@@ -98,6 +100,18 @@ def main() -> int:
   if result.verdict == findings.UNDECIDED:
     return _UNDECIDED
   return 0 if result.is_sufficient else _NOT_SUFFICIENT
+
+
+def _budget() -> int | None:
+  """Returns the largest number of episodes of the search, if it is given."""
+  text = flags.BUDGET.value
+  try:
+    return None if text is None else _BUDGETS.parse(text)
+  except ValueError as error:
+    raise errors.SpecError(
+        f'--budget={text:.80}: must be a number of episodes from'
+        f' {_BUDGETS.lower_bound} to {_BUDGETS.upper_bound}'
+    ) from error
 
 
 def _subject() -> tuple[Any, Any]:

@@ -28,7 +28,8 @@ _DRAW = absl_flags.DEFINE_integer(
 
 def main() -> None:
   """Checks the entry that the flags name."""
-  folder = pathlib.Path(flags.required(flags.ENTRY))
+  why = '; must be the folder of an entry'
+  folder = pathlib.Path(flags.required(flags.ENTRY, why))
   if problem := requirements.missing('pyarrow'):
     raise errors.SpecError(f'cannot read entries: {problem}')
   threads.use_one()

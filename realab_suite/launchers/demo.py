@@ -8,6 +8,7 @@ some seconds.
 """
 
 from collections.abc import Callable, Iterable
+import contextlib
 import functools
 import os
 import pathlib
@@ -34,9 +35,6 @@ _TRAINED = absl_flags.DEFINE_boolean(
 
 EXPERIMENT = 'quick'
 """Experiment of the demonstration."""
-
-FILM = 'film.mp4'
-"""Film in the folder of the demonstration."""
 
 _NEEDED = {
     'agents': ('jax', 'equinox', 'optax'),
@@ -78,12 +76,18 @@ def _play(output: str) -> None:
   from realab_suite.reports import demonstrations
 
   folder = pathlib.Path(output)
+  made = [x for x in (folder, *folder.parents) if not x.exists()]
   if why_no_film is None:
     folder = storage.new_folder(output)
-  played = demonstrations.play_trained()
-  _say_wrapped(' '.join(demonstrations.trained_sentences(played)))
-  shoot = functools.partial(demonstrations.film_trained, played)
-  _film(folder, why_no_film, shoot)
+  try:
+    played = demonstrations.play_trained()
+    _say_wrapped(' '.join(demonstrations.trained_sentences(played)))
+    shoot = functools.partial(demonstrations.film_trained, played)
+    _film(folder, why_no_film, shoot)
+  finally:
+    with contextlib.suppress(OSError):  # The film is in it.
+      for path in made:
+        path.rmdir()
 
 
 def _train(folder: pathlib.Path) -> None:
@@ -134,8 +138,11 @@ def _film(
     why_no_film: Reason why films cannot be made, or `None`.
     shoot: Writes the film that it is given, and returns what that shows.
   """
+  # Imports dm_control.
+  from realab_suite.reports import demonstrations
+
   if why_no_film is None:
-    begun, film = folder / _BEGUN, folder / FILM
+    begun, film = folder / _BEGUN, folder / demonstrations.FILM
     begun.unlink(missing_ok=True)
     try:
       shown = shoot(begun)
@@ -146,7 +153,7 @@ def _film(
     finally:
       begun.unlink(missing_ok=True)
   if why_no_film is not None:
-    program.say(f'\nThere is no film: {why_no_film}')
+    _say_wrapped(f'\nThere is no film: {why_no_film}')
 
 
 def _beginning(steps: int, folder: pathlib.Path) -> str:

@@ -49,17 +49,6 @@ class _PathParser(flags.ArgumentParser[str]):
     return ','.join(map(os.path.expanduser, argument.split(',')))
 
 
-@final
-class _BudgetParser(flags.ArgumentParser[int | str]):
-  """Parser of budgets: numbers of episodes, and names."""
-
-  def parse(self, argument: str) -> int | str:
-    """Returns a number in its bounds, or the name."""
-    if re.fullmatch('-?[0-9]+', argument):
-      return flags.IntegerParser(10, 1_000_000).parse(argument)
-    return argument
-
-
 def _path(name: str, default: str | None, what: str) -> flags.FlagHolder[Any]:
   return flags.DEFINE(_PathParser(), name, default, what, flag_values=_SHARED)
 
@@ -158,15 +147,7 @@ SEEDS = _string(
 )
 SCRIPTED = (POLICIES, CHANNELS, SEEDS, EPISODES)
 
-BUDGET = flags.DEFINE(
-    _BudgetParser(),
-    'budget',
-    None,
-    'For `audit`, the largest number of episodes of the search; default: 1200,'
-    ' or more if the design has many registers. For `sweep`, a named budget:'
-    ' realab-1M or realab-20M.',
-    flag_values=_SHARED,
-)
+BUDGET = _string('budget', None, 'Each launcher that takes it says which.')
 
 # Learners.
 EXPERIMENT = _path(
@@ -178,14 +159,20 @@ _SHARED.mark_as_parsed()
 flags.disclaim_key_flags()
 
 
-def take(*shared: flags.FlagHolder[Any]) -> None:
+def take(*shared: flags.FlagHolder[Any], help_text: str | None = None) -> None:
   """Lets the calling launcher parse shared flags, and shows them in its help.
 
   Call it when the module of the launcher is imported.
+
+  Args:
+    *shared: The flags.
+    help_text: What they mean in this launcher, if that is its own.
   """
   for holder in shared:
     if holder.name not in flags.FLAGS:
       flags.FLAGS[holder.name] = _SHARED[holder.name]
+    if help_text is not None:
+      flags.FLAGS[holder.name].help = help_text
     flags.declare_key_flag(holder.name)
 
 

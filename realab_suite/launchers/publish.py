@@ -25,9 +25,16 @@ flags.take(flags.IMPORT, flags.INPUT, flags.OUTPUT, flags.ENTRY)
 
 def main() -> None:
   """Publishes the sweep that the flags describe."""
-  folder = pathlib.Path(flags.required(flags.INPUT))
+  folder = pathlib.Path(
+      flags.required(
+          flags.INPUT,
+          '; must be the folder of a sweep, with --output or --entry for a new'
+          ' folder',
+      )
+  )
   if (flags.OUTPUT.value is None) == (flags.ENTRY.value is None):
-    raise errors.SpecError('--output, --entry: must be one of the two')
+    given = 'both missing' if flags.ENTRY.value is None else 'both given'
+    raise errors.SpecError(f'--output, --entry: {given}; must be one of them')
   output = pathlib.Path(flags.OUTPUT.value or flags.ENTRY.value)
   if problem := requirements.missing('pyarrow'):
     raise errors.SpecError(f'cannot publish results: {problem}')

@@ -22,7 +22,9 @@ flags.take(
     flags.EXPERIMENT,
     flags.OUTPUT,
     flags.ACCEPT_OTHER_CODE,
-    flags.BUDGET,
+)
+flags.take(
+    flags.BUDGET, help_text='Named budget of the runs: realab-1M or realab-20M.'
 )
 
 _ON_TASK = absl_flags.DEFINE_string(

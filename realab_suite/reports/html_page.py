@@ -12,6 +12,7 @@ from realab_suite.lab.experiments import storage
 from realab_suite.lab.experiments import sweep_results
 from realab_suite.lab.experiments import tables
 from realab_suite.reports import caveats
+from realab_suite.reports import demonstrations
 from realab_suite.reports import headline
 from realab_suite.reports import numbers
 from realab_suite.reports import plots
@@ -22,8 +23,6 @@ PAGE = 'report.html'
 CSV = 'tables.csv'
 MARKDOWN = 'tables.md'
 SEEDS_CSV = 'seeds.csv'
-# Film of a demonstration, which has one learned run.
-_FILM = 'film.mp4'
 
 View = Callable[[sweep_results.Sweep, Mapping[str, numbers.Figures]], str]
 """Returns the figures of a sweep in another format."""
@@ -147,7 +146,10 @@ def _films(sweep: sweep_results.Sweep, output: pathlib.Path) -> dict[str, str]:
   learned = sweep.learned()
   films = {}
   for run in learned:
-    for name in (f'{run.name}.mp4', *([_FILM] if len(learned) == 1 else [])):
+    for name in (
+        f'{run.name}.mp4',
+        *([demonstrations.FILM] if len(learned) == 1 else []),
+    ):
       path = sweep.folder / name
       if path.is_file():
         films[run.name] = name

@@ -15,6 +15,7 @@ from typing import Any, Final
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.config import messages
 from realab_suite.engine import agent_view
 from realab_suite.engine import batch_time_steps
 from realab_suite.evaluation import evaluate
@@ -62,6 +63,7 @@ def publish(folder: pathlib.Path, output: pathlib.Path) -> tuple[int, int]:
   """
   from realab_suite.lab.agents import network_export  # Imports JAX.
 
+  _budget(output)
   sweep = sweep_results.load(folder)
   experiment = _experiment(folder / scheduler.COPY, output)
   files = {scheduler.EXPERIMENT: (folder / scheduler.COPY).read_bytes()}
@@ -100,6 +102,12 @@ def check(
     RealabError: If the entry is not of its budget, has been changed, lacks
       something, or has rows that are not those of its policies.
   """
+  _budget(folder)
+  if not (folder / POLICIES).is_file():
+    raise errors.ResultsError(
+        f'{folder}: has no {POLICIES}; must be a folder that `realab publish'
+        ' --entry` has written'
+    )
   sweep = publishing.load(folder)
   experiment = _experiment(folder / scheduler.EXPERIMENT, folder)
   planned = jobs.plan(experiment)
@@ -161,8 +169,24 @@ def _experiment(
 ) -> experiment_specs.ExperimentSpec:
   """Returns the experiment of an entry, which must be one of its budget."""
   experiment = experiment_specs.load(file)
-  budgets.check(experiment, folder.absolute().parent.name)
+  budgets.check(experiment, _budget(folder))
   return experiment
+
+
+def _budget(folder: pathlib.Path) -> str:
+  """Returns the name of the budget that the folder of an entry is in.
+
+  Raises:
+    UnknownNameError: If it is in another folder.
+  """
+  name = folder.absolute().parent.name
+  if name not in budgets.BUDGETS:
+    raise errors.UnknownNameError(
+        f'{folder}: is in a folder {messages.quote(name)}; must be in one with'
+        f' the name of a budget, {list(budgets.BUDGETS)}, such as'
+        f' {folder.parent / next(iter(budgets.BUDGETS)) / folder.name}'
+    )
+  return name
 
 
 @contextlib.contextmanager

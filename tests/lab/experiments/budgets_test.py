@@ -74,8 +74,9 @@ def test_the_program_refuses_what_is_no_budget(tmp_path):
       (['--budget=realab-1M', '--calibration'], 'without --calibration'),
   ):
     assert problem in in_process.complaint(sweep, *arguments, *others)
-  said = in_process.complaint(audit, '--budget=realab-1M')
-  assert 'must be a number of episodes' in said
+  for budget in ('realab-1M', '5', ''):
+    said = in_process.complaint(audit, f'--budget={budget}')
+    assert f'--budget={budget}: must be a number of episodes from 10' in said
 
 
 def test_the_minutes_are_those_of_agents_and_twins():

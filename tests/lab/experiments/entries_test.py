@@ -75,8 +75,18 @@ def test_an_entry_agrees_with_its_policies(entry):
   assert not list(entry.rglob('*.bin'))
 
 
+@pytest.mark.parametrize(
+    ('folder', 'problem'),
+    [('mine', 'must be in one with'), ('tiny/mine', 'has no policies.json')],
+)
+def test_what_is_no_entry_is_said(folder, problem, tmp_path):
+  said = in_process.complaint(check, f'--entry={tmp_path / folder}')
+  assert f'{tmp_path / folder}: ' in said
+  assert problem in said
+
+
 def test_a_sweep_of_another_budget_is_no_entry(sweep, tmp_path, monkeypatch):
-  with pytest.raises(errors.UnknownNameError, match="budget 'other'"):
+  with pytest.raises(errors.UnknownNameError, match="in a folder 'other'"):
     entries.publish(sweep, tmp_path / 'other' / 'reward')
   monkeypatch.setitem(budgets.BUDGETS, 'tiny', budgets.Budget(300, 1))
   with pytest.raises(errors.SpecError, match='is not of budget tiny: seeds'):
