@@ -171,6 +171,21 @@ def test_keys_name_what_pictures_show(page):
   assert 'True return of decoupled over' in page
 
 
+def test_telephones_fold_the_pictures_of_many_runs(page, tmp_path):
+  assert '<body>' in page
+  run = {'design': 'instantaneous_reward', 'overrides': ['dof=planar']}
+  one = fake_sweep.experiment(
+      runs=dict.fromkeys(('a', 'b', 'c', 'd'), run),
+      baselines=[], seeds=[0], evaluation={'episodes': 2},
+  )  # fmt: skip
+  folder = fake_sweep.build(tmp_path / 'sweep', one)
+  many = pages.write(folder, tmp_path / 'out', with_charts=True)
+  assert '<body class="many">' in many
+  for run in 'abcd':
+    for what in ('figures', 'curves'):
+      assert many.count(f'type="checkbox"> Show {what} of {run}</label>') == 1
+
+
 def test_controls_are_explained_and_have_a_row(page, folder):
   name = 'reward.transplant'
   rows = result_folders.load(folder).runs['reward.secure'].transplants
