@@ -17,6 +17,9 @@ from realab_suite.feedback import measurements
 USUAL: Final = 'usual'
 """Key of a range that gives way to what a world declares."""
 
+FINE: Final = 1e-3
+"""Smallest scale, in m per unit, that a world gets without a warning."""
+
 _Range = measurements.Range
 
 # Largest distance of a block from its place for 0 at the lower end, and between

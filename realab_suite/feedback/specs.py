@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 import functools
 from typing import Annotated, Any, Literal, final
+import warnings
 
 import pydantic
 
@@ -413,7 +414,15 @@ class DesignSpec(validation.Spec):
       if 'scale' not in self.registers[name].model_fields_set:
         source['scale'] = {fitting.USUAL: scale}
     where = f'design {self.name!r}, with the ranges that this world needs'
-    return validation.validate(DesignSpec, data, where)
+    fitted = validation.validate(DesignSpec, data, where)
+    for name, (_, scale) in changes.items():
+      if scale < min(fitting.FINE, self.registers[name].scale):
+        warnings.warn(
+            f'{where}: registers.{name}.scale is {scale:g}, so a block that is'
+            f' 1 mm off adds {1e-3 / scale:g}; state another range, or scale',
+            stacklevel=2,
+        )
+    return fitted
 
   def to_source(self) -> dict[str, Any]:
     """Returns the design with what its registers do not state left open.

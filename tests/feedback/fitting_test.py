@@ -52,7 +52,6 @@ def test_designs_keep_their_digest_where_they_fit_and_load_elsewhere(name: str):
         ((-5, -1), ((-5, 0), 0.08), ((-5, 5), 0.08)),
         ((-3, -3), ((-3, 0), 0.1), ((-3, 3), 0.1)),
         ((30, 30), ((0, 30), 0.066), ((-30, 30), 0.013)),
-        ((-1e3, 7), ((-1e3, 7), 4e-4), ((-1007, 1007), 3.9e-4)),
         ((np.float32(-1), 99), ((-1, 99), 0.02), ((-100, 100), 4e-3)),
     ],
 )
@@ -64,6 +63,20 @@ def test_a_range_is_that_of_the_world_and_takes_no_more_room(
   assert fitted == [reward, score]
   again = specs.load(specs.load(design, ['dof=planar']), ['dof=free'])
   assert again.digest() == design.fitted({'score': declared}).digest()
+
+
+def test_a_scale_that_no_one_would_state_is_said():
+  text = r"'instantaneous_reward', .*: registers.{} is {}, so a block .* adds"
+  design = specs.load(_REWARD)
+  with (
+      pytest.warns(UserWarning, match=text.format('score.scale', '0.0004')),
+      pytest.warns(UserWarning, match=text.format('reward.scale', '0.00039')),
+  ):
+    fitted = design.fitted({'score': (-1e3, 7)})
+  scales = {name: spec.scale for name, spec in fitted.registers.items()}
+  assert scales == {'score': 4e-4, 'reward': 3.9e-4}
+  stated = specs.load(design, [f'registers.{n}.scale=0.0001' for n in scales])
+  stated.fitted({'score': (-1e3, 7)})  # No warning, which would be an error.
 
 
 @pytest.mark.parametrize('declared', [(-1e6, 1e6), (-np.inf, 0), (0, 1e12)])
