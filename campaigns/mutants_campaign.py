@@ -275,8 +275,8 @@ MUTANTS = [
     planting.Mutant(
         'contract', "finding 13: a sense may be called like one of the suite's",
         _OBSERVING,
-        'if max_steps is not None and TIME_LEFT in of_task:',
-        'if max_steps == -1 and TIME_LEFT in of_task:', _ENV,
+        'if max_steps is not None and TIME_LEFT in sense_spec:',
+        'if max_steps == -1 and TIME_LEFT in sense_spec:', _ENV,
     ),
     planting.Mutant(
         'contract', 'finding 14: closing twice is an error', _ENVIRONMENT,
@@ -311,12 +311,12 @@ MUTANTS = [
     ),
     planting.Mutant(
         'contract', 'meters do not measure', _CONTROL_STEP,
-        '''  records += phases.update_meters(view, where() if where else None)
-''', '', _MECH,
+        'records += phases.update_meters(physics, where() if where else None)',
+        'pass', _MECH,
     ),
     planting.Mutant(
         'contract', 'queries are not written', _CONTROL_STEP,
-        '''  records += phases.write_queries(view, queries)
+        '''  records += phases.write_queries(physics, queries)
 ''', '', _MECH,
     ),
     planting.Mutant(

@@ -24,6 +24,7 @@ from realab_suite.engine import environment
 from realab_suite.engine import seeding
 from realab_suite.feedback import mechanisms
 from realab_suite.feedback import specs
+from realab_suite.tasks import base
 from realab_suite.tasks import registry
 
 if TYPE_CHECKING:
@@ -459,7 +460,7 @@ def _connected(
   """Returns the environment of a task with an attached mechanism."""
   embedding.connect_meters(task, mechanism, measurements)
   embedding.add_registers(task, mechanism)
-  env = environment.Environment(
+  env = _class_for(task)(
       task,
       mechanism,
       seed=seed,
@@ -472,6 +473,15 @@ def _connected(
     env.check_placement()
     stack.pop_all()
   return env
+
+
+def _class_for(task: composer.Task) -> type[environment.Environment]:
+  """Returns the environment of a task of this package, or of another one."""
+  if isinstance(task, base.Task):
+    return environment.WorldEnvironment
+  from realab_suite.engine import foreign  # Most programs have no such task.
+
+  return foreign.ForeignEnvironment
 
 
 def _keywords(argument: str, value: Any) -> dict[str, Any]:

@@ -73,7 +73,12 @@ class BatchEnvironment:
     self._entities = hooks.with_start(self._task)
     self._host = hosts.WorldHost(self._task, (num_envs,))
     self._observer = observing.Observer(
-        self._host, self._mechanism, single.max_steps, single.senses
+        self._task,
+        self._task.sense_spec,
+        self._host.sense,
+        self._mechanism,
+        single.max_steps,
+        single.senses,
     )
     self._random_state = seeding.random_state(single.seed, 0, 0, 'batch')
     # `restore` may give several worlds the same number. Arrays of objects keep

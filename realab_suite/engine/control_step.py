@@ -1,4 +1,4 @@
-"""The control step, for one world and for a batch.
+"""The control step of tasks of this package, for one world and for a batch.
 
 `run` implements the list in `docs/architecture.md`. The leading axes of all
 arrays are worlds: `()` for one world, `(worlds,)` for a batch. This module does
@@ -36,7 +36,7 @@ class Outcome(NamedTuple):
 
 def run(
     physics: hosts.SteppedPhysics,
-    host: hosts.Host,
+    host: hosts.WorldHost,
     phases: mechanism_phases.Phases,
     schedule: specs.ScheduleSpec,
     num_substeps: int,
@@ -73,20 +73,19 @@ def run(
     FeedbackProviderError: If a provider failed.
     RegisterValueError: If a written value cannot be stored.
   """
-  view = host.view(physics)
   was_over = host.is_over(physics)
   host.begin_step(physics, controls)
   records: list[registers.Record] = []
-  records += phases.write_queries(view, queries)
+  records += phases.write_queries(physics, queries)
 
-  host.advance(physics, controls, schedule.meter_substep, is_last=False)
+  host.advance(physics, schedule.meter_substep, is_last=False)
   is_ending = host.is_over(physics)
-  records += phases.update_meters(view, where() if where else None)
+  records += phases.update_meters(physics, where() if where else None)
 
   between = schedule.provider_substep - schedule.meter_substep
-  host.advance(physics, controls, between, is_last=False)
+  host.advance(physics, between, is_last=False)
   feedback, next_states = phases.update_providers(
-      view,
+      physics,
       observation,
       provider_keys,
       provider_states,
@@ -95,10 +94,7 @@ def run(
   records += feedback
 
   rest = num_substeps - schedule.provider_substep
-  host.advance(physics, controls, rest, is_last=True)
+  host.advance(physics, rest, is_last=True)
   ending = host.end_step(physics, was_over, is_ending)
-  reward = ending.true_reward
-  num_steps = phases.end_step(
-      physics, axes.choose(axes.is_finite(reward), reward, 0.0)
-  )
+  num_steps = phases.end_step(physics, ending.true_reward)
   return Outcome(records, ending, next_states, num_steps)

@@ -4,10 +4,14 @@ Only this module and `foreign` use private attributes of `composer.Environment`.
 They are those of dm_control 1.0.50, and a test fails when they change.
 """
 
+import abc
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, final
+import contextlib
+from typing import TYPE_CHECKING, Any, ClassVar, final
 
 from dm_control import composer
+from dm_control import mjcf
+from dm_control.composer import observation as composer_observation
 from dm_control.rl import control
 import dm_env
 from dm_env import specs as dm_env_specs
@@ -22,6 +26,7 @@ from realab_suite.engine import events
 from realab_suite.engine import hooks
 from realab_suite.engine import hosts
 from realab_suite.engine import observing
+from realab_suite.engine import placement
 from realab_suite.engine import seeding
 from realab_suite.engine import single_physics
 from realab_suite.entities import registers
@@ -35,14 +40,21 @@ if TYPE_CHECKING:
   from realab_suite.engine import snapshots
 
 
-@final
-class Environment(composer.Environment):
+class Environment(composer.Environment, abc.ABC):
   """An environment with one world, a feedback mechanism and event sinks.
 
   `reward` is the constant 0.0. The observations `registers/<name>` contain the
   feedback. Only the event sinks get the true reward. `docs/architecture.md`
   lists the parts of a control step.
+
+  Attributes:
+    PHYSICS: Class of the physics.
+    IS_RECOMPILED: True if the model may change between episodes, and the
+      physics is stepped as in Composer, from derived quantities.
   """
+
+  PHYSICS: ClassVar[type[mjcf.Physics]]
+  IS_RECOMPILED: ClassVar[bool]
 
   def __init__(
       self,
@@ -68,17 +80,14 @@ class Environment(composer.Environment):
     self._physics: Any
     self._mechanism = mechanism
     self._phases = mechanism.phases
-    mechanism.leave_phases()
     self._max_steps = max_steps
     self._closed = False
     self._has_extra_hooks = False
-    self._host = host = _host_of(task)
-    hooks.refuse_uncalled(task)
     state.manage_room(task.root_entity.mjcf_model)
     super().__init__(
         task,
         random_state=seeding.random_state(seed, world, 0, 'construction'),
-        recompile_mjcf_every_episode=host.IS_RECOMPILED,
+        recompile_mjcf_every_episode=self.IS_RECOMPILED,
     )
     self._fit_to_world()
     self._seed, self._world, self._episode = seed, world, -1
@@ -89,20 +98,16 @@ class Environment(composer.Environment):
     self._states: list[Any] = []
     self._observation: dict[str, np.ndarray] = {}
     self._sinks: list[events.EventSink] = []
-    self._start_check = host.start_check(self._physics, mechanism)
 
   # The interface for evaluators and launchers. Agents do not get this object.
 
+  @abc.abstractmethod
   def check_placement(self) -> None:
     """Checks the places of registers, before the first episode.
 
     Raises:
       SpecError: If something is in the way of a register.
     """
-    self._refuse_if_closed()
-    self._host.check_placement(
-        self._physics, self._mechanism, self._start_check
-    )
 
   @property
   def mechanism(self) -> mechanisms.FeedbackMechanism:
@@ -296,6 +301,7 @@ class Environment(composer.Environment):
     self._observation = observing.frozen(saved.observation_of_world())
     (self._reset_next_step,) = saved.is_pending
 
+  @abc.abstractmethod
   def check_start(self, physics: Any) -> None:
     """Checks an episode that has just been initialized.
 
@@ -305,7 +311,6 @@ class Environment(composer.Environment):
     Raises:
       EpisodeInitializationError: If something is inside a register.
     """
-    self._start_check(physics)
 
   def snapshot_header(self, model: Any = None) -> dict[str, Any]:
     """Returns the header that a snapshot needs to fit this environment.
@@ -390,20 +395,7 @@ class Environment(composer.Environment):
     # If anything fails here, the next step starts with a reset.
     self._reset_next_step = True
     try:
-      outcome = control_step.run(
-          self._physics,
-          self._host,
-          self._phases,
-          self._schedule,
-          self._n_sub_steps,
-          queries=queries,
-          controls=controls,
-          observation=self._observer.for_providers(
-              self._physics, self._observation
-          ),
-          provider_keys=self._keys,
-          provider_states=self._states,
-      )
+      outcome = self._run(queries, controls)
       reads = self._observe()
     except control.PhysicsError:
       self._end(events.End.DIVERGENCE)
@@ -455,7 +447,7 @@ class Environment(composer.Environment):
   def _notify(self, notify: Callable[[events.EventSink], None]) -> None:
     """Notifies the sinks, which may read the physics."""
     if self._sinks:
-      with self._host.unchanged(self._physics):
+      with self._unchanged():
         for sink in self._sinks:
           notify(sink)
 
@@ -476,10 +468,37 @@ class Environment(composer.Environment):
       self._hooks.initialize_episode_mjcf(self._random_state)
       self._recompile_physics_and_update_observables()
       self._fit_to_world()
-    with self._host.initializing(self._physics, self._mechanism):
+    with self._initializing():
       self._hooks.initialize_episode(self._physics_proxy, self._random_state)
     self.check_start(self._physics)
-    self._host.begin_observing(self._physics_proxy)
+    self._observation_updater.reset(self._physics_proxy, self._random_state)
+
+  def _initializing(self) -> contextlib.AbstractContextManager[Any]:
+    """Returns the context in which an episode is initialized."""
+    return self._physics.reset_context()
+
+  def _unchanged(self) -> contextlib.AbstractContextManager[None]:
+    """Returns a context in which reads do not change later steps."""
+    return contextlib.nullcontext()
+
+  @abc.abstractmethod
+  def _run(
+      self, queries: np.ndarray, controls: np.ndarray
+  ) -> control_step.Outcome:
+    """Runs a control step of the task and the mechanism.
+
+    Args:
+      queries: Values for the query registers, `(queries,)`.
+      controls: Controls of the task, `(controls,)`.
+    """
+
+  def _observation_for_providers(self) -> dict[str, np.ndarray]:
+    """Returns what the action responds to, and what providers alone sense."""
+    return self._observer.for_providers(self._physics, self._observation)
+
+  @abc.abstractmethod
+  def _sensed(self) -> tuple[dict[str, dm_env_specs.Array], observing.Sense]:
+    """Returns the specs of senses in the compiled world, and what senses."""
 
   def _fit_to_world(self) -> None:
     """Makes what depends on the compiled world.
@@ -490,23 +509,17 @@ class Environment(composer.Environment):
     Raises:
       SpecError: If the design or the selected senses do not fit the world.
     """
-    self._host.start(
-        self._mechanism,
-        self._hooks,
-        self._random_state,
-        lambda: self._observation_updater,
-    )
     self._observer = observing.Observer(
-        self._host, self._mechanism, self._max_steps, self._selected_senses
+        self._task,
+        *self._sensed(),
+        self._mechanism,
+        self._max_steps,
+        self._selected_senses,
     )
     self._schedule = self._mechanism.design.schedule_for(self._n_sub_steps)
     self._codec = action_codec.for_design(
         self._task.action_spec(self._physics_proxy), self._mechanism
     )
-
-  def _make_observation_updater(self) -> Any:
-    own_senses = self._mechanism.own_senses
-    return self._host.make_updater(self._selected_senses, own_senses)
 
   def _recompile_physics(self) -> None:
     """Compiles the model into a physics class of this engine."""
@@ -514,18 +527,64 @@ class Environment(composer.Environment):
       self._physics.free()
     model = self._task.root_entity.mjcf_model
     with state.room_for_slots(model):
-      self._physics = self._host.PHYSICS.from_mjcf_model(model)
-    self._physics.legacy_step = self._host.IS_RECOMPILED
+      self._physics = self.PHYSICS.from_mjcf_model(model)
+    self._physics.legacy_step = self.IS_RECOMPILED
 
   def _refuse_if_closed(self) -> None:
     if self._closed:
       raise errors.ClosedError('this environment is closed; load another one')
 
 
-def _host_of(task: composer.Task) -> hosts.Host:
-  """Returns the host of one world, for a task of this package or another."""
-  if isinstance(task, base.Task):
-    return hosts.WorldHost(task)
-  from realab_suite.engine import foreign  # Most programs have no such task.
+@final
+class WorldEnvironment(Environment):
+  """The environment of a task of this package."""
 
-  return foreign.ForeignHost(task)
+  PHYSICS = single_physics.ThinPhysics
+  IS_RECOMPILED = False  # Steps begin from the state; see `ThinPhysics`.
+
+  def __init__(
+      self,
+      task: base.Task,
+      mechanism: mechanisms.FeedbackMechanism,
+      **options: Any,
+  ) -> None:
+    """Initializes the environment; see `Environment`."""
+    mechanism.leave_phases()
+    hooks.refuse_uncalled(task)
+    self._host = hosts.WorldHost(task)
+    super().__init__(task, mechanism, **options)
+    self._host.call_hooks(self._hooks, self._random_state)
+    self._start_check = placement.StartCheck(self._physics, task, mechanism)
+
+  def check_placement(self) -> None:
+    self._refuse_if_closed()
+    physics, mechanism = self._physics, self._mechanism
+    surveyed = self._start_check.surveyed
+    surveyed = surveyed or placement.survey(physics, mechanism, True)
+    placement.check(physics, self._task.root_entity, mechanism, surveyed)
+    placement.check_start(physics, self._task, surveyed)
+
+  def check_start(self, physics: Any) -> None:
+    self._start_check(physics)
+
+  def _run(
+      self, queries: np.ndarray, controls: np.ndarray
+  ) -> control_step.Outcome:
+    return control_step.run(
+        self._physics,
+        self._host,
+        self._phases,
+        self._schedule,
+        self._n_sub_steps,
+        queries=queries,
+        controls=controls,
+        observation=self._observation_for_providers(),
+        provider_keys=self._keys,
+        provider_states=self._states,
+    )
+
+  def _sensed(self) -> tuple[dict[str, dm_env_specs.Array], observing.Sense]:
+    return self._task.sense_spec, self._host.sense
+
+  def _make_observation_updater(self) -> Any:
+    return composer_observation.Updater({})  # The task makes its senses.

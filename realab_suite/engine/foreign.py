@@ -6,9 +6,8 @@ foreign task may have hooks in substeps, may keep state in Python, and is
 compiled for each episode. Batches and snapshots therefore do not support it.
 """
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 import contextlib
-import functools
 from typing import Any, final
 
 from dm_control import composer
@@ -20,31 +19,21 @@ import mujoco
 import numpy as np
 
 from realab_suite.engine import clearance
+from realab_suite.engine import control_step
+from realab_suite.engine import environment
 from realab_suite.engine import gl_contexts
 from realab_suite.engine import hosts
 from realab_suite.engine import observing
 from realab_suite.engine import placement
 from realab_suite.engine import replacement
 from realab_suite.entities import meters
-from realab_suite.entities import views
+from realab_suite.feedback import composer_hooks
 from realab_suite.feedback import mechanisms
 
 
 @final
 class ForeignPhysics(mjcf.Physics):
-  """`mjcf.Physics` with the methods that the engine calls."""
-
-  def refresh(self) -> None:
-    """Updates the quantities derived from positions and velocities."""
-    views.refresh(self)
-    self._dirty = False
-
-  def check(self) -> None:
-    """Does nothing, because `step` checks its result."""
-
-  def advance(self, num_substeps: int) -> None:
-    """Runs substeps in the same way as Composer."""
-    self.step(num_substeps)
+  """`mjcf.Physics` that draws with the renderer of this package."""
 
   def _make_rendering_contexts(self) -> None:
     """Creates the contexts for `render`.
@@ -55,108 +44,42 @@ class ForeignPhysics(mjcf.Physics):
     self._contexts = gl_contexts.for_pictures(self.model)
 
 
-@contextlib.contextmanager
-def unchanged(physics: mjcf.Physics) -> Iterator[None]:
-  """Returns a context in which reads do not change later steps.
-
-  Reading a bound attribute after a write recomputes all derived quantities and
-  replaces the solver's warm start. The context restores it.
-
-  Args:
-    physics: Physics of a foreign task.
-  """
-  is_dirty = physics.is_dirty
-  warm_start = np.array(physics.data.qacc_warmstart)
-  try:
-    yield
-  finally:
-    physics.data.qacc_warmstart[:] = warm_start
-    if is_dirty:
-      physics.mark_as_dirty()
-
-
 @final
-class ForeignHost(hosts.Host):
-  """Host of a foreign task.
+class ForeignEnvironment(environment.Environment):
+  """The environment of a foreign task.
 
-  The senses that the task offers are the observables that are enabled when an
-  episode begins, except those of meters and providers.
+  It is that of Composer, in which hooks of the mechanism run the phases, with a
+  layer around it for actions, senses, signals and the true reward. The senses
+  that the task offers are the observables that are enabled when an episode
+  begins, except those of meters and providers.
   """
 
   PHYSICS = ForeignPhysics
   IS_RECOMPILED = True
 
-  def __init__(self, task: composer.Task) -> None:
-    """Initializes the host.
-
-    Args:
-      task: Foreign task.
-    """
-    self._task = task
-    self._hooks: Any = task
-    self._random_state: np.random.RandomState | None = None
-    self._updater: hosts.UpdaterOf = lambda: self.make_updater(None)
-    self._view: views.View | None = None
-    self._has_registers = False
-
-  def make_updater(
-      self, senses: Sequence[str] | None, added: Collection[str] = ()
-  ) -> composer_observation.Updater:
-    """Returns an updater of the selected observables.
-
-    Observables that are not selected are not computed.
-
-    Args:
-      senses: Names of the selected senses; `None` for all enabled observables.
-      added: Names of senses that providers have as well, if they are offered.
-
-    Raises:
-      SpecError: If a name is not that of an enabled observable.
-    """
-    selected = {
-        name: observable
-        for name, observable in self._task.observables.items()
-        if observable.enabled and not isinstance(observable, meters.Unseen)
-    }
-    if senses is not None:
-      observing.refuse_unknown(senses, [*selected, observing.TIME_LEFT])
-      wanted = {*senses, *added}
-      selected = {n: one for n, one in selected.items() if n in wanted}
-    return composer_observation.Updater(
-        selected,
-        self._task.physics_steps_per_control_step,
-        strip_singleton_buffer_dim=True,
-    )
-
-  def check_placement(
-      self, physics: Any, mechanism: mechanisms.FeedbackMechanism, start: Any
-  ) -> None:
-    del start
-    placement.check(physics, self._task.root_entity, mechanism)
-
-  def start_check(
-      self, physics: Any, mechanism: mechanisms.FeedbackMechanism
-  ) -> Callable[[Any], None]:
-    del physics  # The model changes between episodes.
-    return functools.partial(check_start, mechanism=mechanism)
-
-  def start(
+  def __init__(
       self,
+      task: composer.Task,
       mechanism: mechanisms.FeedbackMechanism,
-      step_hooks: Any,
-      random_state: np.random.RandomState | None,
-      updater: hosts.UpdaterOf,
+      **options: Any,
   ) -> None:
-    self._has_registers = bool(mechanism.registers)
-    self._hooks = step_hooks
-    self._random_state = random_state
-    self._updater = updater
-    self._sense_spec = dict(updater().observation_spec())
+    """Initializes the environment; see `environment.Environment`."""
+    # Without registers, nothing is between Composer and the task.
+    self._phase_hooks: composer_hooks.EmbeddedHooks | None = None
+    if mechanism.registers:
+      self._phase_hooks = composer_hooks.EmbeddedHooks(mechanism)
+    mechanism.leave_phases(self._phase_hooks)
+    super().__init__(task, mechanism, **options)
+
+  def check_placement(self) -> None:
+    self._refuse_if_closed()
+    placement.check(self._physics, self._task.root_entity, self._mechanism)
+
+  def check_start(self, physics: Any) -> None:
+    check_start(physics, self._mechanism)
 
   @contextlib.contextmanager
-  def initializing(
-      self, physics: Any, mechanism: mechanisms.FeedbackMechanism
-  ) -> Iterator[None]:
+  def _initializing(self) -> Iterator[None]:
     """Returns the context in which an episode is initialized.
 
     Foreign tasks look for positions without any contacts, and for directions
@@ -164,18 +87,14 @@ class ForeignHost(hosts.Host):
     not even the floor they stand on, and rays pass through them. At the end,
     registers are placed where nothing else is.
 
-    Args:
-      physics: Physics of one world.
-      mechanism: Registers, meters and providers.
-
     Raises:
       EpisodeInitializationError: If there is no clear place for a register. The
         next attempt generates another world.
     """
+    physics = self._physics
     model = physics.model
-    self._view = None  # It would keep the previous world alive.
     with physics.reset_context():
-      geoms = list(clearance.owners(physics, mechanism.registers))
+      geoms = list(clearance.owners(physics, self._mechanism.registers))
       # Rays pass through geoms without opacity.
       values = (
           model.geom_contype,
@@ -190,78 +109,98 @@ class ForeignHost(hosts.Host):
       finally:
         for value, old in zip(values, before, strict=True):
           value[geoms] = old
-      replacement.place(physics, mechanism)
+      replacement.place(physics, self._mechanism)
 
-  def begin_observing(self, physics: Any) -> None:
-    self._updater().reset(physics, self._random_state)
+  @contextlib.contextmanager
+  def _unchanged(self) -> Iterator[None]:
+    """Returns a context in which reads do not change later steps.
 
-  def unchanged(self, physics: Any) -> contextlib.AbstractContextManager[None]:
-    return unchanged(physics)
+    Reading a bound attribute after a write recomputes all derived quantities
+    and replaces the solver's warm start. The context restores it.
+    """
+    physics = self._physics
+    is_dirty = physics.is_dirty
+    warm_start = np.array(physics.data.qacc_warmstart)
+    try:
+      yield
+    finally:
+      physics.data.qacc_warmstart[:] = warm_start
+      if is_dirty:
+        physics.mark_as_dirty()
 
-  @property
-  def sense_spec(self) -> dict[str, specs.Array]:
-    return self._sense_spec
+  def _run(
+      self, queries: np.ndarray, controls: np.ndarray
+  ) -> control_step.Outcome:
+    """Runs a control step as Composer does, with an error of the reward kept.
 
-  def sense(
-      self, physics: hosts.SteppedPhysics, names: Collection[str]
-  ) -> dict[str, np.ndarray]:
-    del physics  # The updater has read it already.
-    observation = self._updater().get_observation()
-    return {n: np.array(observation[n]) for n in names if n in observation}
-
-  def begin_step(
-      self, physics: hosts.SteppedPhysics, controls: np.ndarray
-  ) -> None:
-    self._hooks.before_step(physics, controls, self._random_state)
-    self._updater().prepare_for_next_control_step()
-    self._begin_access(physics)
-
-  def advance(
-      self,
-      physics: hosts.SteppedPhysics,
-      controls: np.ndarray,
-      num_substeps: int,
-      is_last: bool,
-  ) -> None:
-    if not num_substeps:
-      return
-    if self._has_registers:
-      self.view(physics).refresh()
-    for i in range(num_substeps):
-      self._hooks.before_substep(physics, controls, self._random_state)
-      physics.advance(1)
-      self._hooks.after_substep(physics, self._random_state)
-      # The update of the last substep comes after `after_step`.
-      if not (is_last and i == num_substeps - 1):
-        self._updater().update()
-    if is_last:
-      self._hooks.after_step(physics, self._random_state)
-      self._updater().update()
-    else:
-      self._begin_access(physics)
-
-  def view(self, physics: Any) -> Any:
-    if not self._has_registers:
-      return physics
-    if self._view is None:
-      self._view = views.View(physics)
-    return self._view
-
-  def _begin_access(self, physics: Any) -> None:
-    """Begins a part of the step in which registers are accessed."""
-    if self._has_registers:
-      self.view(physics).open(physics)
-
-  def end_step(
-      self, physics: hosts.SteppedPhysics, was_over: Any, is_ending: Any
-  ) -> hosts.Ending:
-    del was_over, is_ending
-    reward, failure = hosts.true_reward(self._task, physics, float)
-    return hosts.Ending(
+    Composer's own `step` would raise the error, which could reach the agent.
+    """
+    task, physics, hooks = self._task, self._physics_proxy, self._phase_hooks
+    random_state, updater = self._random_state, self._observation_updater
+    if hooks is not None:
+      hooks.take(
+          self._schedule,
+          queries,
+          self._observation_for_providers(),
+          self._keys,
+          self._states,
+      )
+    self._hooks.before_step(physics, controls, random_state)
+    updater.prepare_for_next_control_step()
+    for i in range(self._n_sub_steps):
+      if i:
+        updater.update()
+      if hooks is not None:
+        hooks.run_phases(physics)
+      self._substep(controls)
+    self._hooks.after_step(physics, random_state)
+    updater.update()
+    reward, failure = hosts.true_reward(task, physics, float)
+    ending = hosts.Ending(
         reward,
         failure,
-        float(self._task.get_discount(physics)),
-        bool(self._task.should_terminate_episode(physics)),
+        float(task.get_discount(physics)),
+        bool(task.should_terminate_episode(physics)),
+    )
+    return control_step.Outcome(
+        [] if hooks is None else hooks.records,
+        ending,
+        self._states if hooks is None else hooks.states,
+        self._phases.end_step(self._physics, reward),
+    )
+
+  def _sensed(self) -> tuple[dict[str, specs.Array], observing.Sense]:
+    updater = self._observation_updater
+
+    def sense(physics: Any, names: Collection[str]) -> dict[str, np.ndarray]:
+      del physics  # The updater has read it already.
+      observation = updater.get_observation()
+      return {n: np.array(observation[n]) for n in names if n in observation}
+
+    return dict(updater.observation_spec()), sense
+
+  def _make_observation_updater(self) -> composer_observation.Updater:
+    """Returns an updater of the selected observables.
+
+    Observables that are not selected are not computed.
+
+    Raises:
+      SpecError: If a selected name is not that of an enabled observable.
+    """
+    selected = {
+        name: observable
+        for name, observable in self._task.observables.items()
+        if observable.enabled and not isinstance(observable, meters.Unseen)
+    }
+    senses = self._selected_senses
+    if senses is not None:
+      observing.refuse_unknown(senses, [*selected, observing.TIME_LEFT])
+      wanted = {*senses, *self._mechanism.own_senses}
+      selected = {n: one for n, one in selected.items() if n in wanted}
+    return composer_observation.Updater(
+        selected,
+        self._task.physics_steps_per_control_step,
+        strip_singleton_buffer_dim=True,
     )
 
 

@@ -36,15 +36,13 @@ def refuse_unused(task: composer.Task, hook_name: str) -> None:
     )
 
 
-def refuse_uncalled(task: composer.Task) -> None:
+def refuse_uncalled(task: base.Task) -> None:
   """Refuses a task of this package with hooks that the engine never calls.
 
   Raises:
     SpecError: If the task or one of its entities has such a hook, or a provider
       is attached by itself, whose state no snapshot would contain.
   """
-  if not isinstance(task, base.Task):
-    return
   parts: list[tuple[Any, type]] = [(task, composer.Task)]
   parts += [(e, composer.Entity) for e in task.root_entity.iter_entities()]
   for part, kind in parts:

@@ -1,33 +1,23 @@
-"""Hosts: everything that depends on the kind of task.
+"""The host of a task of this package, in the control step.
 
-`control_step` defines the order of events. A host compiles and advances the
-physics, detects the end of the episode and returns the senses. This module
-contains the interface and the host of this package's tasks; `foreign` contains
-the host of foreign tasks. `embedding` has what differs before the world is
-compiled.
+`control_step` defines the order of events. The host advances the physics,
+detects the end of the episode and returns the senses. `foreign` has the step of
+foreign tasks, and `embedding` what differs before the world is compiled.
 """
 
-import abc
-from collections.abc import Callable, Collection, Mapping, Sequence
-import contextlib
+from collections.abc import Callable, Collection
 import functools
 import traceback
-from typing import Any, ClassVar, NamedTuple, NoReturn, Protocol, final
+from typing import Any, NamedTuple, NoReturn, Protocol, final
 
 from dm_control import composer
-from dm_control import mjcf
-from dm_control.composer import observation as composer_observation
 from dm_control.rl import control
-from dm_env import specs
 import numpy as np
 
 from realab_suite import errors
 from realab_suite.config import messages
-from realab_suite.engine import placement
-from realab_suite.engine import single_physics
 from realab_suite.entities import axes
 from realab_suite.entities import protocols
-from realab_suite.feedback import mechanisms
 from realab_suite.tasks import base
 
 
@@ -58,9 +48,6 @@ class SteppedPhysics(protocols.Physics, Protocol):
   def advance(self, num_substeps: int) -> None:
     """Steps the physics from its present state."""
 
-  def refresh(self) -> None:
-    """Updates the quantities derived from positions and velocities."""
-
   def check(self) -> None:
     """Checks the positions and velocities that the last substep resulted in.
 
@@ -72,180 +59,8 @@ class SteppedPhysics(protocols.Physics, Protocol):
     """
 
 
-UpdaterOf = Callable[[], composer_observation.Updater]
-"""Function that returns the observation updater of the compiled model."""
-
-
-class Host(abc.ABC):
-  """Interface between the engine and a task.
-
-  It is made before the physics is compiled. `start` completes it.
-
-  Attributes:
-    PHYSICS: Class of the physics of one world.
-    IS_RECOMPILED: True if the model may change between episodes, and the
-      physics is stepped as in Composer, from derived quantities.
-  """
-
-  PHYSICS: ClassVar[type[mjcf.Physics]]
-  IS_RECOMPILED: ClassVar[bool]
-
-  _task: composer.Task
-
-  def make_updater(
-      self, senses: Sequence[str] | None, added: Collection[str] = ()
-  ) -> composer_observation.Updater:
-    """Returns an updater of the observables that senses are made of.
-
-    Args:
-      senses: Names of the selected senses; `None` for all of them.
-      added: Names of senses that providers have as well, if they are offered.
-
-    Raises:
-      SpecError: If the task does not offer a sense.
-    """
-    del senses, added
-    return composer_observation.Updater({})
-
-  @abc.abstractmethod
-  def check_placement(
-      self, physics: Any, mechanism: mechanisms.FeedbackMechanism, start: Any
-  ) -> None:
-    """Checks the places of registers in a newly compiled world.
-
-    Args:
-      physics: Physics of one world, whose state is reset.
-      mechanism: Registers, meters and providers.
-      start: Result of `start_check` for the same physics.
-
-    Raises:
-      SpecError: If something is in the way of a register.
-    """
-
-  @abc.abstractmethod
-  def start_check(
-      self, physics: Any, mechanism: mechanisms.FeedbackMechanism
-  ) -> Callable[[Any], None]:
-    """Returns a function that checks the start of an episode.
-
-    The function takes the physics of one world, after `initialize_episode`, and
-    raises an EpisodeInitializationError if something is inside a register.
-
-    Args:
-      physics: Physics of one world, whose state is reset.
-      mechanism: Registers, meters and providers.
-    """
-
-  @abc.abstractmethod
-  def start(
-      self,
-      mechanism: mechanisms.FeedbackMechanism,
-      step_hooks: Any,
-      random_state: np.random.RandomState | None,
-      updater: UpdaterOf,
-  ) -> None:
-    """Completes the host of a compiled world.
-
-    Args:
-      mechanism: Registers, meters and providers.
-      step_hooks: The task itself, or all hooks of a `composer.Environment`.
-      random_state: Random generator for the hooks; `None` in a batch.
-      updater: Function that returns the present observation updater.
-    """
-
-  @abc.abstractmethod
-  def initializing(
-      self, physics: Any, mechanism: mechanisms.FeedbackMechanism
-  ) -> contextlib.AbstractContextManager[None]:
-    """Returns the context in which an episode is initialized.
-
-    Args:
-      physics: Physics of one world.
-      mechanism: Registers, meters and providers.
-    """
-
-  def begin_observing(self, physics: Any) -> None:
-    """Prepares the senses of an episode that has been initialized."""
-    del physics
-
-  def unchanged(self, physics: Any) -> contextlib.AbstractContextManager[None]:
-    """Returns a context in which reads do not change later steps."""
-    del physics
-    return contextlib.nullcontext()
-
-  # The control step.
-
-  def view(self, physics: Any) -> Any:
-    """Returns the physics through which the phases access registers."""
-    return physics
-
-  @property
-  @abc.abstractmethod
-  def sense_spec(self) -> dict[str, specs.Array]:
-    """Specs of the senses that the task offers, by name."""
-
-  @property
-  def default_senses(self) -> Sequence[str]:
-    """Names of the senses of an agent for which none are selected."""
-    return tuple(self.sense_spec)
-
-  @property
-  def privileged_senses(self) -> Mapping[str, Callable[[Any], np.ndarray]]:
-    """Functions of the physics that providers may sense; see `Task`."""
-    senses: Mapping[str, Any] = getattr(self._task, 'privileged_senses', {})
-    return senses
-
-  @abc.abstractmethod
-  def sense(
-      self, physics: SteppedPhysics, names: Collection[str]
-  ) -> dict[str, np.ndarray]:
-    """Returns new arrays with the selected senses, by name."""
-
-  @abc.abstractmethod
-  def begin_step(self, physics: SteppedPhysics, controls: np.ndarray) -> None:
-    """Passes the controls of a step, `(..., controls)`, to the task."""
-
-  @abc.abstractmethod
-  def advance(
-      self,
-      physics: SteppedPhysics,
-      controls: np.ndarray,
-      num_substeps: int,
-      is_last: bool,
-  ) -> None:
-    """Runs substeps of the physics, and the hooks after the last substep.
-
-    Args:
-      physics: Physics of one world or of a batch.
-      controls: Controls of this step, `(..., controls)`.
-      num_substeps: Number of substeps; may be 0, unless they are the last.
-      is_last: True if these are the last substeps of the control step.
-    """
-
-  def is_over(self, physics: SteppedPhysics) -> Any:
-    """Returns True for worlds whose episode the task has ended, `(...)` bool.
-
-    For a foreign task it is always False, because Composer checks only at the
-    end of a step.
-    """
-    del physics
-    return False
-
-  @abc.abstractmethod
-  def end_step(
-      self, physics: SteppedPhysics, was_over: Any, is_ending: Any
-  ) -> Ending:
-    """Returns the result of a control step, after its last substep.
-
-    Args:
-      physics: Physics of one world or of a batch.
-      was_over: Value of `is_over` when the step began.
-      is_ending: Value of `is_over` when the meters acted.
-    """
-
-
 @final
-class WorldHost(Host):
+class WorldHost:
   """Host of a task of this package, for one world or a batch.
 
   It runs no Python in substeps. When the task ends an episode, the episode
@@ -254,11 +69,6 @@ class WorldHost(Host):
   otherwise the agent would get no feedback on it. Rewards of a step that began
   after the ending do not count.
   """
-
-  PHYSICS = single_physics.ThinPhysics
-  IS_RECOMPILED = False  # Steps begin from the state; see `ThinPhysics`.
-
-  _task: base.Task
 
   def __init__(
       self, task: base.Task, batch_shape: tuple[int, ...] = ()
@@ -290,43 +100,17 @@ class WorldHost(Host):
         for name, spec in self._task.sense_spec.items()
     }
 
-  def check_placement(
-      self, physics: Any, mechanism: mechanisms.FeedbackMechanism, start: Any
+  def call_hooks(
+      self, step_hooks: Any, random_state: np.random.RandomState
   ) -> None:
-    surveyed = start.surveyed or placement.survey(physics, mechanism, True)
-    placement.check(physics, self._task.root_entity, mechanism, surveyed)
-    placement.check_start(physics, self._task, surveyed)
+    """Lets a step call all hooks of a `composer.Environment`, not the task's.
 
-  def start_check(
-      self, physics: Any, mechanism: mechanisms.FeedbackMechanism
-  ) -> Callable[[Any], None]:
-    return placement.StartCheck(physics, self._task, mechanism)
-
-  def start(
-      self,
-      mechanism: mechanisms.FeedbackMechanism,
-      step_hooks: Any,
-      random_state: np.random.RandomState | None,
-      updater: UpdaterOf,
-  ) -> None:
-    del mechanism, updater  # The task makes its senses itself.
+    Args:
+      step_hooks: Hooks of the environment.
+      random_state: Random generator for them.
+    """
     self._hooks = step_hooks
     self._random_state = random_state
-
-  def initializing(
-      self, physics: Any, mechanism: mechanisms.FeedbackMechanism
-  ) -> contextlib.AbstractContextManager[None]:
-    del mechanism
-    context: contextlib.AbstractContextManager[None] = physics.reset_context()
-    return context
-
-  @property
-  def sense_spec(self) -> dict[str, specs.Array]:
-    return self._task.sense_spec
-
-  @property
-  def default_senses(self) -> Sequence[str]:
-    return self._task.default_senses
 
   def sense(
       self, physics: SteppedPhysics, names: Collection[str]
@@ -370,16 +154,22 @@ class WorldHost(Host):
     )
 
   def begin_step(self, physics: SteppedPhysics, controls: np.ndarray) -> None:
+    """Passes the controls of a step, `(..., controls)`, to the task."""
     self._hooks.before_step(physics, controls, self._random_state)
 
   def advance(
       self,
       physics: SteppedPhysics,
-      controls: np.ndarray,
       num_substeps: int,
       is_last: bool,
   ) -> None:
-    del controls
+    """Runs substeps of the physics, and the hooks after the last substep.
+
+    Args:
+      physics: Physics of one world or of a batch.
+      num_substeps: Number of substeps; may be 0, unless they are the last.
+      is_last: True if these are the last substeps of the control step.
+    """
     if num_substeps:
       physics.advance(num_substeps)
     if is_last:
@@ -389,11 +179,19 @@ class WorldHost(Host):
       self._task.latch_events(physics)
 
   def is_over(self, physics: SteppedPhysics) -> Any:
+    """Returns True where the task has ended the episode, `(...)` bool."""
     return self._as_bool(self._task.should_terminate_episode(physics))
 
   def end_step(
       self, physics: SteppedPhysics, was_over: Any, is_ending: Any
   ) -> Ending:
+    """Returns the result of a control step, after its last substep.
+
+    Args:
+      physics: Physics of one world or of a batch.
+      was_over: Value of `is_over` when the step began.
+      is_ending: Value of `is_over` when the meters acted.
+    """
     reward, failure = true_reward(self._task, physics, self._as_number)
     discount = self._as_number(self._task.get_discount(physics))
     return Ending(

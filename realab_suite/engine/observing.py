@@ -1,20 +1,24 @@
 """Observations: the agent's senses and the readings of registers."""
 
-from collections.abc import Collection, Mapping, Sequence
-from typing import final
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any, final
 
+from dm_control import composer
 from dm_env import specs
 import numpy as np
 
 from realab_suite import errors
 from realab_suite.config import messages
-from realab_suite.engine import hosts
 from realab_suite.entities import meters
+from realab_suite.entities import protocols
 from realab_suite.entities import registers
 from realab_suite.feedback import clean_contents
 from realab_suite.feedback import mechanisms
 from realab_suite.feedback import providers
 from realab_suite.policies import base as policies_base
+from realab_suite.tasks import base
+
+Sense = Callable[[Any, Collection[str]], dict[str, np.ndarray]]
 
 TIME_LEFT = 'time_left'
 """Sense with the remaining share of the episode, from 1 to 0."""
@@ -33,7 +37,9 @@ class Observer:
 
   def __init__(
       self,
-      host: hosts.Host,
+      task: composer.Task,
+      sense_spec: Mapping[str, specs.Array],
+      sense: Sense,
       mechanism: mechanisms.FeedbackMechanism,
       max_steps: int | None,
       senses: Sequence[str] | None = None,
@@ -41,7 +47,9 @@ class Observer:
     """Initializes the observer.
 
     Args:
-      host: Host of the task.
+      task: Task of this package, or a foreign one.
+      sense_spec: Specs of the senses that it offers, by name.
+      sense: Function that returns new arrays with senses of these names.
       mechanism: Registers, meters and providers.
       max_steps: Maximum length of an episode in control steps, or `None`.
       senses: Names of the selected senses, in any order; `None` for the default
@@ -52,18 +60,19 @@ class Observer:
         sense that is not selected, if nothing would be observed, or if the task
         has a sense called `time_left` and `max_steps` is not `None`.
     """
-    self._host = host
+    self._sense_of_task = sense
     self._mechanism = mechanism
     self._phases = mechanism.phases
     self._max_steps = max_steps
-    of_task = host.sense_spec
-    if max_steps is not None and TIME_LEFT in of_task:
+    if max_steps is not None and TIME_LEFT in sense_spec:
       raise errors.SpecError(
           f'the task has its own observable {TIME_LEFT!r}; rename it, or pass'
           ' max_steps=None'
       )
-    offered = dict(of_task)
-    default = list(host.default_senses)
+    offered = dict(sense_spec)
+    default = [*sense_spec]
+    if isinstance(task, base.Task):
+      default = [*task.default_senses]
     if max_steps is not None:
       offered[TIME_LEFT] = specs.BoundedArray((), np.float32, 0.0, 1.0)
       default.append(TIME_LEFT)
@@ -72,7 +81,7 @@ class Observer:
     # In the order of the specs, whatever the order of the selection.
     self._specs = {n: spec for n, spec in offered.items() if n in selected}
     self._keys = {
-        name: f'senses/{name}' for name in self._specs if name in of_task
+        name: f'senses/{name}' for name in self._specs if name in sense_spec
     }
     self._has_time_left = len(self._keys) < len(self._specs)
     if senses is not None and not (self._specs or mechanism.read_by_agent):
@@ -81,7 +90,8 @@ class Observer:
           f' be among {list(offered)}'
       )
     privileged = {
-        f'privileged/{n}': f for n, f in host.privileged_senses.items()
+        f'privileged/{n}': function
+        for n, function in getattr(task, 'privileged_senses', {}).items()
     }
     for i, provider in enumerate(mechanism.design.providers):
       is_own = provider.senses == providers.OWN
@@ -94,8 +104,8 @@ class Observer:
       )
     # What providers sense and the agent does not.
     added = [n for n in mechanism.own_senses if n not in self._specs]
-    self._added = {n: f'senses/{n}' for n in added if n in of_task}
-    self._adds_time_left = TIME_LEFT in added and TIME_LEFT not in of_task
+    self._added = {n: f'senses/{n}' for n in added if n in sense_spec}
+    self._adds_time_left = TIME_LEFT in added and TIME_LEFT not in sense_spec
     self._privileged = {n: f for n, f in privileged.items() if n in added}
 
   @property
@@ -121,7 +131,7 @@ class Observer:
     }
 
   def observe(
-      self, physics: hosts.SteppedPhysics
+      self, physics: protocols.Physics
   ) -> tuple[dict[str, np.ndarray], list[registers.Read]]:
     """Makes an observation.
 
@@ -139,7 +149,7 @@ class Observer:
     return observation, reads
 
   def for_providers(
-      self, physics: hosts.SteppedPhysics, observation: dict[str, np.ndarray]
+      self, physics: protocols.Physics, observation: dict[str, np.ndarray]
   ) -> dict[str, np.ndarray]:
     """Returns an observation with what providers alone sense, by key.
 
@@ -162,7 +172,7 @@ class Observer:
 
   def _sense(
       self,
-      physics: hosts.SteppedPhysics,
+      physics: protocols.Physics,
       keys: Mapping[str, str],
       has_time_left: bool,
   ) -> dict[str, np.ndarray]:
@@ -175,7 +185,7 @@ class Observer:
     """
     senses = {}
     if keys:
-      for name, value in self._host.sense(physics, keys).items():
+      for name, value in self._sense_of_task(physics, keys).items():
         senses[keys[name]] = value
     if has_time_left:
       spent = self._mechanism.step_count(physics) / self._max_steps

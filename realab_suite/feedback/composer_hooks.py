@@ -2,8 +2,8 @@
 
 Composer calls the hooks of entities in the order of attachment and passes them
 neither the action nor the agent's observation. A mechanism that is attached to
-an arena therefore runs designs that need only registers and meters;
-`suite.embed` runs all of them.
+an arena therefore runs designs that need only registers and meters. The
+environment of `suite.embed` passes the rest to `EmbeddedHooks`.
 
 The phases of a mechanism run before a substep. All entities have then seen the
 result of the previous one, so it does not matter whether the mechanism was
@@ -23,6 +23,7 @@ from realab_suite import errors
 from realab_suite.config import integers
 from realab_suite.entities import meters
 from realab_suite.entities import modelled
+from realab_suite.entities import registers
 from realab_suite.entities import state
 from realab_suite.entities import views
 from realab_suite.entities.registers import ports
@@ -40,6 +41,9 @@ class _Hooks(composer.Entity, abc.ABC):
 
   It has the state of the current episode that is not physical: the states and
   random keys of the providers.
+
+  Attributes:
+    states: State of each provider after the last step.
   """
 
   def _start(
@@ -54,7 +58,7 @@ class _Hooks(composer.Entity, abc.ABC):
     # Of the current episode; the physics contains the rest of its state.
     self._episode = -1
     self._keys: Any = None
-    self._states: list[Any] = []
+    self.states: list[Any] = []
     self._observation: dict[str, np.ndarray] = {}
 
   @property
@@ -68,7 +72,7 @@ class _Hooks(composer.Entity, abc.ABC):
     del physics, random_state
     self._episode += 1
     self._keys = None
-    self._states = self._phases.initial_states(())
+    self.states = self._phases.initial_states(())
 
   def _begin_step(
       self, physics: Any, random_state: np.random.RandomState, *stream: int
@@ -108,16 +112,131 @@ class _Hooks(composer.Entity, abc.ABC):
     copy = np.random.RandomState()
     copy.set_state(random_state.get_state())
     entropy = [self._episode, *copy.randint(2**31, size=4).tolist(), *stream]
-    number = len(self._states)
+    number = len(self.states)
     words = np.random.SeedSequence(entropy).generate_state(
         2 * number, np.uint64
     )
     return words.reshape(number, 2)
 
 
+class _PhaseHooks(_Hooks, abc.ABC):
+  """Base class for hooks that run the phases of a mechanism.
+
+  Attributes:
+    records: Writes and reads of the current control step.
+  """
+
+  def _start(
+      self, owner: Any, title: str, phases: feedback_phases.Phases
+  ) -> None:
+    super()._start(owner, title, phases)
+    self.records: list[registers.Record] = []
+    self._schedule: specs.ScheduleSpec | None = None
+    self._view: Any = None
+    # Substeps of the current control step so far.
+    self._num_done = 0
+
+  def after_compile(
+      self, physics: Any, random_state: np.random.RandomState
+  ) -> None:
+    del random_state
+    self._data = physics.data.ptr
+    self._view = views.View(physics)
+
+  def before_step(
+      self, physics: Any, random_state: np.random.RandomState
+  ) -> None:
+    self._begin_step(physics, random_state)
+    self._num_done = 0
+    self.records = []
+
+  def run_phases(self, physics: Any) -> None:
+    """Runs the phases that follow the substeps of a control step so far."""
+    now, phases, view = self._num_done, self._phases, self._view
+    meter_substep, provider_substep = self._substeps
+    if now not in (meter_substep, provider_substep):
+      return
+    view.open(physics)
+    if now == meter_substep:
+      self.records += phases.update_meters(view)
+    if now == provider_substep:
+      log, self.states = phases.update_providers(
+          view, self._observation, self._keys, self.states
+      )
+      self.records += log
+    view.refresh()
+
+  def after_substep(
+      self, physics: Any, random_state: np.random.RandomState
+  ) -> None:
+    del physics, random_state
+    self._num_done += 1
+
+  @property
+  def _substeps(self) -> tuple[int, int]:
+    """Substeps after which meters and providers act."""
+    if self._schedule is None:
+      raise errors.SpecError(
+          f'{self._title} has no schedule, so it needs the number of substeps;'
+          ' pass num_substeps=task.physics_steps_per_control_step to'
+          ' FeedbackMechanism'
+      )
+    return self._schedule.meter_substep, self._schedule.provider_substep
+
+
 @final
-class ComposerHooks(_Hooks):
-  """Runs the phases of a mechanism from Composer's hooks."""
+class EmbeddedHooks(_PhaseHooks):
+  """Runs all phases of a mechanism, for the environment of `suite.embed`.
+
+  The environment passes what Composer does not pass to entities, and calls
+  `run_phases` before the hooks of a substep, which may write positions. It also
+  ends the control step, because only it gets the true reward.
+  """
+
+  def _build(self, mechanism: Any) -> None:
+    """Makes the hooks of a connected `FeedbackMechanism`."""
+    title = f'design {mechanism.design.name!r}'
+    self._start(mechanism, title, mechanism.phases)
+    self._queries = np.zeros(0)
+
+  def take(
+      self,
+      schedule: specs.ScheduleSpec,
+      queries: np.ndarray,
+      observation: dict[str, np.ndarray],
+      keys: np.ndarray,
+      states: list[Any],
+  ) -> None:
+    """Takes what the phases of the next control step need.
+
+    Args:
+      schedule: Substeps after which meters and providers act.
+      queries: Values for the query registers, `(queries,)`.
+      observation: Observation that the action responds to, with what providers
+        alone sense, by name.
+      keys: Random key of each provider in this episode, `(providers, 2)`.
+      states: State of each provider.
+    """
+    self._schedule, self._queries = schedule, queries
+    self._observation, self._keys, self.states = observation, keys, states
+
+  def initialize_episode(
+      self, physics: Any, random_state: np.random.RandomState
+  ) -> None:
+    """Does nothing, because the environment has the states of an episode."""
+
+  def run_phases(self, physics: Any) -> None:
+    """Writes the queries as well, before the first substep."""
+    if not self._num_done:
+      self._view.open(physics)
+      self.records += self._phases.write_queries(self._view, self._queries)
+      self._view.refresh()
+    super().run_phases(physics)
+
+
+@final
+class ComposerHooks(_PhaseHooks):
+  """Runs the phases of a mechanism in an environment of Composer."""
 
   def _build(
       self, mechanism: Any, num_substeps: int | Callable[[], int] | None
@@ -132,16 +251,12 @@ class ComposerHooks(_Hooks):
     title = f'design {mechanism.design.name!r}'
     self._start(mechanism, title, mechanism.phases)
     self._mechanism = mechanism
-    self._schedule: specs.ScheduleSpec | None = None
     self._count_substeps: Callable[[], int] | None = None
     if callable(num_substeps):
       self._count_substeps = num_substeps
     else:
       self._fit_schedule(num_substeps)
     self._is_connected = False
-    self._view: Any = None
-    # Substeps of the current control step so far.
-    self._num_done = 0
 
   def initialize_episode_mjcf(
       self, random_state: np.random.RandomState
@@ -158,7 +273,6 @@ class ComposerHooks(_Hooks):
       SpecError: If the design needs what Composer does not pass to entities, or
         does not fit the world.
     """
-    del random_state
     state.manage_room(self.mjcf_model)
     if self._count_substeps is not None:
       number = integers.check('num_substeps', self._count_substeps(), 1)
@@ -166,41 +280,21 @@ class ComposerHooks(_Hooks):
     if not self._is_connected:
       self._connect()
       self._is_connected = True
-    self._data = physics.data.ptr
-    self._view = views.View(physics)
+    super().after_compile(physics, random_state)
 
   def before_step(
       self, physics: Any, random_state: np.random.RandomState
   ) -> None:
     """Reads the registers that the agent's action responds to."""
-    self._begin_step(physics, random_state)
-    self._num_done = 0
+    super().before_step(physics, random_state)
     self._view.open(physics)
     self._observe(self._view)
 
   def before_substep(
       self, physics: Any, random_state: np.random.RandomState
   ) -> None:
-    """Runs the phases that follow the substeps so far."""
     del random_state
-    now, phases, view = self._num_done, self._phases, self._view
-    meter_substep, provider_substep = self._substeps
-    if now not in (meter_substep, provider_substep):
-      return
-    view.open(physics)
-    if now == meter_substep:
-      phases.update_meters(view)
-    if now == provider_substep:
-      _, self._states = phases.update_providers(
-          view, self._observation, self._keys, self._states
-      )
-    view.refresh()
-
-  def after_substep(
-      self, physics: Any, random_state: np.random.RandomState
-  ) -> None:
-    del physics, random_state
-    self._num_done += 1
+    self.run_phases(physics)
 
   def after_step(
       self, physics: Any, random_state: np.random.RandomState
@@ -235,18 +329,6 @@ class ComposerHooks(_Hooks):
           ' of this environment; if the task changes it between episodes, pass'
           ' num_substeps=lambda: task.physics_steps_per_control_step'
       )
-
-  @property
-  def _substeps(self) -> tuple[int, int]:
-    """Substeps after which meters and providers act."""
-    if self._schedule is None:
-      raise errors.SpecError(
-          f'design {self._mechanism.design.name!r} has no schedule, so it needs'
-          ' the number of substeps; pass'
-          ' num_substeps=task.physics_steps_per_control_step to'
-          ' FeedbackMechanism'
-      )
-    return self._schedule.meter_substep, self._schedule.provider_substep
 
   def _connect(self) -> None:
     """Connects the meters.
@@ -351,8 +433,8 @@ class ProviderHooks(_Hooks):
     del random_state
     for meter in self._meters:
       meter.measure_once(physics)
-    log, self._states = self._phases.update_providers(
-        physics, self._observation, self._keys, self._states
+    log, self.states = self._phases.update_providers(
+        physics, self._observation, self._keys, self.states
     )
     self._phases.end_step(physics, 0.0)
     if log:

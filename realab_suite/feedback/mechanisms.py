@@ -145,9 +145,9 @@ class FeedbackMechanism(modelled.ModelledEntity):
     registers = super().iter_entities(exclude_self)
     return itertools.chain(registers, meters, self._providers, hooks)
 
-  def leave_phases(self) -> None:
-    """Leaves the phases of control steps to the caller."""
-    self._hooks = None
+  def leave_phases(self, hooks: composer.Entity | None = None) -> None:
+    """Leaves the phases of control steps to the caller, or to its hooks."""
+    self._hooks = hooks
     self.observables.disable_all()
 
   @property

@@ -374,7 +374,8 @@ class Phases:
 
     Args:
       physics: One world or a batch of worlds.
-      reward: True reward of the control step, `(...)`.
+      reward: True reward of the control step, `(...)`; only finite numbers
+        count.
 
     Returns:
       Number of completed control steps of the episode, `(...)`.
@@ -382,7 +383,8 @@ class Phases:
     counters = self._counters.of(physics)
     num_steps = counters.step_count[()] + 1
     counters.step_count[...] = num_steps
-    counters.score[...] = counters.score[()] + reward
+    paid = axes.choose(axes.is_finite(reward), reward, 0.0)
+    counters.score[...] = counters.score[()] + paid
     return num_steps
 
   def read_for_agent(self, physics: protocols.Physics) -> list[records.Read]:

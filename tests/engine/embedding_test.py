@@ -61,6 +61,16 @@ def test_a_task_cannot_be_embedded_twice(
     first.close()
 
 
+def test_an_embedded_task_in_another_environment_is_refused():
+  env = _embed(helpers.PointTask())
+  env.reset()
+  composer.Environment(env.task)
+  with pytest.raises(errors.SpecError, match='the task is in two environments'):
+    env.step(helpers.no_op(env))
+  assert env.step(helpers.no_op(env)).first()
+  assert env.step(helpers.no_op(env)).mid()
+
+
 # Problems that come up when the design is attached, connected, compiled and
 # placed.
 _BAD = {

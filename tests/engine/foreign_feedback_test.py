@@ -74,6 +74,36 @@ def test_an_embedded_task_may_offer_measurements():
   np.testing.assert_allclose(written.requested, 0.01)
 
 
+def test_rewards_that_are_no_finite_numbers_are_not_in_the_score():
+  task = helpers.PointTask()
+  paid = iter([1.0, np.nan, 'not a number', np.inf, 2.0, 0.0])
+  task.reward = lambda physics: next(paid)
+  env, sink = helpers.embed(task, helpers.SCORED)
+  env.reset()
+  for _ in range(6):
+    env.step([0.0])
+  assert sink.requested('score') == [0.0, 1.0, 1.0, 1.0, 1.0, 3.0]
+
+
+def test_positions_written_in_substeps_act_as_without_registers():
+  def play(design: Any) -> list[float]:
+    task = helpers.PointTask()
+    task.joint.stiffness = 30.0
+
+    def write(physics: Any, action: Any, random_state: Any) -> None:
+      physics.bind(task.joint).qpos = 0.9 * physics.bind(task.joint).qpos
+
+    task.before_substep = write
+    env, _ = helpers.embed(task, design)
+    env.reset()
+    steps = [env.step([1.0]) for _ in range(20)]
+    return [float(step.observation['senses/bead'][0]) for step in steps]
+
+  bare, beside = play('none'), play(helpers.SCORED)
+  assert np.ptp(bare) > 1e-4
+  np.testing.assert_allclose(beside, bare, rtol=1e-9)
+
+
 def test_a_sense_that_is_called_like_one_of_ours_is_refused():
   class Clashing(helpers.PointTask):
 

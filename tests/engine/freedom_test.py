@@ -55,25 +55,10 @@ class _Free(helpers.PointTask):
     return 0.9
 
 
-def _look_at_options(task: _Free, physics: Any) -> list[Any]:
-  options = physics.model.opt
-  steps = task.physics_steps_per_control_step
-  return [steps, options.integrator, options.solver, *options.gravity]
-
-
-def _assign(name: str, *values: Any) -> Any:
-  def change(task: _Free, episode: int, random_state: Any) -> None:
-    option = task.root_entity.mjcf_model.option
-    target = task if hasattr(task, name) else option
-    setattr(target, name, values[episode])
-
-  return change, _look_at_options
-
-
 def _timesteps(*steps: tuple[float, float]) -> Any:
   return (
       lambda task, episode, random_state: task.set_timesteps(*steps[episode]),
-      _look_at_options,
+      lambda task, physics: task.physics_steps_per_control_step,
   )
 
 
@@ -96,11 +81,6 @@ def _change_props(task: _Free, episode: int, random_state: Any) -> None:
 def _find_props(task: _Free, physics: Any) -> Any:
   boxes = physics.model.geom_type == mujoco.mjtGeom.mjGEOM_BOX
   return len(task.props), boxes.sum()
-
-
-def _set_friction(task: _Free, episode: int, random_state: Any) -> None:
-  task.joint.frictionloss = random_state.uniform(0.0, 0.5)
-  task.joint.damping = episode
 
 
 def _look_at_joint(task: _Free, physics: Any) -> float:
@@ -145,12 +125,6 @@ def _write_in_steps(task: _Free, episode: int, random_state: Any) -> None:
 _FREEDOMS: dict[str, Any] = {
     'timesteps': _timesteps((0.02, 0.005), (0.02, 0.001), (0.1, 0.01)),
     'one substep': _timesteps((0.05, 0.01), (0.03, 0.03), (0.02, 0.01)),
-    'physics timestep': _assign('physics_timestep', 0.025, 0.05, 0.01),
-    'control timestep': _assign('control_timestep', 0.03, 0.01, 0.07),
-    'gravity': _assign('gravity', [1, 0, 0], [0, 0, -9], [-3, 0, 1]),
-    'integrator': _assign('integrator', 'Euler', 'RK4', 'implicit'),
-    'solver': _assign('solver', 'PGS', 'Newton', 'CG'),
-    'friction': (_set_friction, _look_at_joint),
     'props': (_change_props, _find_props),
     'motors': (_add_motor, lambda task, physics: physics.model.nu),
     'delays': (_set_delays, lambda task, physics: task.bead.update_interval),

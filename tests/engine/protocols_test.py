@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from realab_suite.engine import batch_physics
-from realab_suite.engine import foreign
 from realab_suite.engine import single_physics
 
 _WRITTEN = ('qpos', 'qvel', 'ctrl', 'mocap_pos', 'mocap_quat', 'active')
@@ -38,7 +37,6 @@ def _batch(root: mjcf.RootElement) -> batch_physics.BatchPhysics:
 
 _KINDS = {
     'mjcf.Physics': mjcf.Physics.from_mjcf_model,
-    'ForeignPhysics': foreign.ForeignPhysics.from_mjcf_model,
     'ThinPhysics': single_physics.ThinPhysics.from_mjcf_model,
     'batch': _batch,
     'world of a batch': lambda root: _batch(root).world(1),
