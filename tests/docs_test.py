@@ -63,11 +63,6 @@ def fixture_registries():
   logging.set_verbosity(verbosity)
 
 
-def _is_of_an_evaluator(page):
-  """Returns whether code needs results; then it runs with the commands."""
-  return any('results/' in block.text for block in _blocks(page, 'python'))
-
-
 def _blocks(page, kind):
   """Returns the blocks of a language that are not the file of a program."""
   return [
@@ -80,7 +75,7 @@ def _blocks(page, kind):
 def _pages_with_code():
   for page in pages.all_pages():
     blocks = _blocks(page, 'python')
-    if blocks and not _is_of_an_evaluator(page):
+    if blocks:
       renders = any("'camera'" in block.text for block in blocks)
       yield pytest.param(page, marks=[pytest.mark.camera] if renders else [])
 
@@ -103,24 +98,10 @@ def test_python_blocks_of_a_page_print_what_it_says(
         pytest.skip(f'{error.name} is in an extra')
       raise
     printed = capsys.readouterr().out
-    assert printed == output.get(block.line, printed)
+    assert printed == output.get(block.line, ''), f'{page}:{block.line}'
   if page == 'docs/your_own.md':
     # While its defence is registered.
     _check_the_experiment_with_a_defence_of_ones_own()
-
-
-def test_pages_that_must_show_output_do():
-  shown = {
-      page: ''.join(pages.outputs(page).values()) for page in pages.all_pages()
-  }
-  one_push, work = 'push' + ' work' * 9, 'work' + ' work' * 9
-  for line in ('homing: objective 5.9, of which gained 0.0', work):
-    assert f'{line}\n' in shown['docs/your_own.md']
-  assert shown['docs/defences.md'] == (
-      f'1 1 0.0\n3 3 3.0\n3 2 0.0\n{one_push}\ntrue 9, off by 5.0 units\n'
-  )
-  assert "'senses/camera': (4, 32, 32, 3)" in shown['docs/registers.md']
-  assert shown['docs/measure.md'] == '1.0\n1.0\n'
 
 
 def _load(content):

@@ -2,7 +2,6 @@
 
 import ast
 import re
-import shlex
 import tempfile
 
 import pytest
@@ -61,8 +60,6 @@ def _definitions(page):
 
 def _script(piece, sockets):
   """Returns the script of a piece, with sockets in a folder of the test."""
-  if piece.kind == 'python':
-    return f'python -c {shlex.quote(piece.text)}'
   text = piece.text.replace('<this repository>', 'URL')
   text = text.replace('unix:/tmp/realab/', f'unix:{sockets}/')
   text = re.sub(r' \[[^\]=]*\]', '', text) if 'campaigns.' in text else text
@@ -109,16 +106,10 @@ def _why_not(script):
 
 def _commands(page):
   """Returns the pieces of a page that are run here."""
-  found = pages.pieces(page)
-  needs_results = any(
-      piece.kind == 'python' and 'results/' in piece.text for piece in found
-  )
   return [
       piece
-      for piece in found
-      if piece.kind in ('bash', 'span')
-      or pages.file_of(piece)
-      or (piece.kind == 'python' and needs_results)
+      for piece in pages.pieces(page)
+      if piece.kind in ('bash', 'span') or pages.file_of(piece)
   ]
 
 
