@@ -50,6 +50,7 @@ test-core: .venv/dev
 
 lint: .venv/dev
 	$(PY) -m ruff check -q .
+	.venv/bin/lint-imports --no-logo --no-cache
 	@# Both take a processor each, so they run at once.
 	$(PY) -m mypy & types=$$!; $(PY) -m pyink --check -q .; formatted=$$?; \
 	  wait $$types && exit $$formatted
