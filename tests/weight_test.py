@@ -21,6 +21,7 @@ _BESIDE = (
     'benchmarks',
     'campaigns',
     'configs',
+    'docs',
     'examples',
     'pictures',
     'tests',

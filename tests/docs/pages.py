@@ -49,7 +49,7 @@ def all_pages() -> list[str]:
       for pattern in (
           'README.md', 'CONTRIBUTING.md', 'GLOSSARY.md', 'docs/*.md',
           'docs/site/*.md', 'docs/notebooks/*.ipynb', 'benchmarks/README.md',
-          'compat/*/README.md',
+          'compat/*/README.md', 'docs/results/*.py',
           'realab_suite/*.py', 'realab_suite/launchers/*.py', 'campaigns/*.py',
           'benchmarks/*.py', 'pictures/*.py', 'examples/*.py',
       )

@@ -6,7 +6,7 @@ pytest.importorskip('jax', reason='jax is in the extra `agents`')
 pytest.importorskip('optax', reason='optax is in the extra `agents`')
 pytest.importorskip('equinox', reason='equinox is in the extra `agents`')
 
-from campaigns import defences_table
+from docs.results import defences_table
 from realab_suite.lab.experiments import result_folders
 from realab_suite.reports import numbers
 from tests.lab.experiments import fake_sweep

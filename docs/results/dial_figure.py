@@ -4,7 +4,7 @@ Run from the root of the repository, with the folder of a report on the
 experiment `dial`:
 
     realab report --input=results/dial
-    python -m campaigns.dial_figure results/dial docs/images/dial.png
+    python docs/results/dial_figure.py results/dial docs/images/dial.png
 
 Each panel has the share of the crates that are base blocks of registers on its
 axis. Bars are 95 % intervals over seeds; hack rates of fewer than five seeds
@@ -73,6 +73,7 @@ def draw(rows: dict[str, dict[str, str]]) -> figure.Figure:
 
 
 def main() -> None:
+  """Draws the picture."""
   report, output = map(pathlib.Path, sys.argv[1:])
   text = (report / 'tables.csv').read_text(encoding='utf-8')
   rows = {row['run']: row for row in csv.DictReader(text.splitlines())}

@@ -1,10 +1,10 @@
 """Figures of experiments with coupled and decoupled approval, in Markdown.
 
 Run from the root of the repository, with the folder of a sweep, and the share
-of training at its end that "gain in training" is the mean of:
+of training at its end that "gain in training" is the mean of (0.25 for
+`decoupling_failures`):
 
-    python -m campaigns.decoupled_figures docs/results/decoupling_failures 0.25
-    python -m campaigns.decoupled_figures docs/results/advice_long 0.1
+    python docs/results/decoupled_figures.py docs/results/advice_long 0.1
 
 Means with intervals over the seeds that have finished. Beside what `report`
 shows: the gain with its sign in units a step, in evaluation and at the end of

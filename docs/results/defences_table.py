@@ -3,7 +3,7 @@
 Run from the root of the repository, with a picture to draw and the folders of
 sweeps of reward learning with and without defences, such as `defences`:
 
-    python -m campaigns.defences_table table.png docs/results/defences
+    python docs/results/defences_table.py table.png docs/results/defences
 
 It prints a line for each run, and the best and the worst world of a design that
 ran in several. Runs are compared with reward learning without a defence,
@@ -343,6 +343,7 @@ def _mark(
 
 
 def main() -> None:
+  """Prints the tables, and draws the picture."""
   picture, *folders = map(pathlib.Path, sys.argv[1:])
   found = [one for folder in folders for one in entries(folder)]
   for rows in (lines(found), worlds(found)):
