@@ -7,6 +7,10 @@ Run from the root of the repository, about half an hour:
 Each bug of `MUTANTS` is one change to the text of a copy of the package
 (`planting.py`), on which its tests have to fail. The description of a bug that
 is a fault of another package begins with the number of the finding.
+
+mutmut 3.8 does not replace the list: of 39 bugs listed for six files, none is
+among the 1,511 that it makes of them, and its copies of methods and its frames
+of tracebacks fail the tests of the agent's view before any bug is planted.
 """
 
 import pathlib

@@ -1,6 +1,6 @@
 """Bad actions are rejected by name and value, and the world does not change.
 
-`hostile_actions_test.py` sends random ones among good ones, also to batches.
+`machine_test.py` sends them among other calls in any order.
 """
 
 from typing import Any
@@ -113,3 +113,5 @@ def test_an_index_applies_its_row_of_the_action_set(pair: Any):
   for index, controls in ((1, [1, 0, 0]), (8, [1, 0, -1]), (0, [0, 0, 0])):
     found = helpers.to_bytes(env.step(index))
     assert found == helpers.to_bytes(twin.step([*controls, 0, 0, 0]))
+  for index in (-1, 14, 0.5, np.nan):
+    assert 'action' in _refuse(env, index)

@@ -23,17 +23,6 @@ def fixture_world(compiled):
   return compiled
 
 
-def _shove_everything(world, random_state, register):
-  """Pushes, lifts and turns every block of a register, at random."""
-  for block in register.blocks:
-    worlds.shove(
-        world.physics,
-        block,
-        random_state.uniform((-40, -40, 0), (40, 40, 30)),
-        random_state.uniform(-2, 2, 3),
-    )
-
-
 def test_values_do_not_drift_without_tampering(world):
   values = [0.0, *np.linspace(register_worlds.LOW, register_worlds.HIGH, 4)]
   worst = dict.fromkeys(world.registers, 0.0)
@@ -47,25 +36,6 @@ def test_values_do_not_drift_without_tampering(world):
       moved = np.abs(corruption.permanent) * register_worlds.SCALE
       worst[name] = max(worst[name], error, moved)
   assert {name: error for name, error in worst.items() if error > 1e-9} == {}
-
-
-@register_worlds.some_varieties
-def test_corruption_is_reading_minus_applied_value(world, variety):
-  register = world.registers[variety.name]
-  random_state = np.random.RandomState(0)
-  for _ in range(5):
-    register.write(
-        world.physics,
-        random_state.uniform(register_worlds.LOW, register_worlds.HIGH),
-    )
-    for _ in range(2):
-      _shove_everything(world, random_state, register)
-      error = register.read(world.physics) - register.applied(world.physics)
-      corruption = register.inspect(world.physics)
-      parts = (
-          corruption.obstruction, corruption.permanent, corruption.temporary
-      )  # fmt: skip
-      assert error == pytest.approx(sum(parts), abs=1e-9)
 
 
 @pytest.mark.parametrize('dof', registers.DOFS)

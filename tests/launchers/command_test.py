@@ -384,16 +384,6 @@ def test_an_option_that_a_learner_lacks_is_refused_in_one_line(
   assert list(tmp_path.iterdir()) == [file]
 
 
-def test_the_help_of_a_flag_states_one_default():
-  stated = {}
-  for values in (absl_flags.FLAGS, flags._SHARED):
-    for name in values:
-      if 'Default:' in values[name].help:
-        stated[name] = values[name].default
-  assert {'design', 'policy', 'episodes'} <= stated.keys()
-  assert not any(stated.values())
-
-
 @pytest.mark.parametrize('flag', ['--asks=correction', '--wait'])
 def test_a_design_of_a_person_has_questions_of_its_own(flag, tmp_path):
   line = in_process.complaint(

@@ -11,7 +11,6 @@ from realab_suite.lab.audit import aiming
 from realab_suite.lab.audit import audits
 from realab_suite.lab.audit import episodes
 from realab_suite.lab.audit import findings
-from realab_suite.lab.audit import searches
 from realab_suite.lab.verdicts import hacking
 from realab_suite.lab.verdicts import stakes
 from realab_suite.lab.verdicts import verdicts
@@ -152,13 +151,6 @@ def test_a_rare_gain_is_compared_in_more_worlds(monkeypatch):
   audit = auditor._compare(None, None)
   assert compared == [20, 60]
   assert audit.is_exploit
-
-
-def test_the_default_budget_is_sufficient():
-  auditor = _auditor('paired_decoupled_approval', budget=None)
-  assert auditor._is_sufficient
-  assert auditor._budget == searches.DEFAULT_BUDGET
-  assert not _auditor('paired_decoupled_approval', budget=500)._is_sufficient
 
 
 def test_the_plan_is_repeated_bit_by_bit():
