@@ -81,8 +81,8 @@ def test_arguments_reach_training_evaluation_baselines_and_replays(
   options = training.Options(lambda line: None)
   with mock.patch.object(suite, 'load_batch', load_batch):
     paths = [training.run(job, tmp_path, options) for job in planned]
-  # A baseline; training and evaluation of a learner.
-  assert sizes == [(3, (12, 16)), (2, (8, 8)), (3, (12, 16))]
+  # A baseline; both segments of training, and the evaluation of a learner.
+  assert sizes == [(3, (12, 16)), *2 * [(2, (8, 8))], (3, (12, 16))]
   for job, path in zip(planned, paths, strict=True):
     env = _replay(job, path)
     assert (env.senses, env.task.camera_size) == (_SENSES, (12, 16))
