@@ -198,7 +198,7 @@ class AgentView(_View, dm_env.Environment):
   """The interface of an environment for an agent in the same process.
 
       env = suite.load('unlock_door', 'standard', design='value_advice')
-      env.add_sink(ledger.Ledger())
+      env.add_sink(ledgers.Ledger())
       agent = make_agent(agent_view.AgentView(env))
 
   It has `reset`, `step`, `close` and the specs, and nothing else. `reward` is

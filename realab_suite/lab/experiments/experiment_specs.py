@@ -67,7 +67,7 @@ class RunSpec(validation.Spec):
     num_seeds: Number of seeds, the first ones of the experiment; `None` for all
       of them.
     task: Domain and task, or `None` for that of the experiment.
-    data: Folder of an export (`datasets.export`) whose episodes the learner is
+    data: Folder of an export (`realab export`) whose episodes the learner is
       trained from, without acting; `None` if it acts. `steps` are then recorded
       control steps.
     twin_data: The same for the twin, recorded in the secure channel.

@@ -1,6 +1,6 @@
 """Tests of learners and defences on probe worlds, against answers on paper.
 
-The answers are in the docstring of `realab_suite.testing.probes`. Where a
+The answers are in the docstring of `realab_suite.lab.testing.probes`. Where a
 defence changes them, the sum is beside the case. `push` adds 5 to each reading
 from the step of the push on, 0.5 in `small_push`; `work` adds 1.
 """

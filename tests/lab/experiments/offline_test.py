@@ -1,6 +1,6 @@
 """Tests of learning from recorded episodes, on probe worlds.
 
-The answers are in the docstring of `realab_suite.testing.probes`. Random
+The answers are in the docstring of `realab_suite.lab.testing.probes`. Random
 actions push in a third of the steps.
 """
 
