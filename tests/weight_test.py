@@ -97,12 +97,16 @@ def test_a_budget_is_lowered_when_its_room_shrinks(room):
   ), f'{room}: {_WEIGHTS[room]:,.1f}; lower its budget in {_PAGE.name}'
 
 
-def test_the_reading_path_is_short_and_its_files_exist():
+@pytest.mark.parametrize(
+    ('path', 'most_files', 'most_lines'),
+    [('Reading path', 40, 8_000), ('Verdict path', 6, 2_000)],
+)
+def test_a_path_is_short_and_its_files_exist(path, most_files, most_lines):
   page = _PAGE.read_text(encoding='utf-8')
-  section = page.partition('\n## Reading path\n')[2].partition('\n## ')[0]
+  section = page.partition(f'\n## {path}\n')[2].partition('\n## ')[0]
   names = re.findall(r'^\| `(.*?\.py)` \|', section, re.M)
-  assert len(set(names)) == len(names) <= 40
+  assert len(set(names)) == len(names) <= most_files
   lines = [
       (_ROOT / _PACKAGE / name).read_bytes().splitlines() for name in names
   ]
-  assert 0 < sum(map(len, lines)) <= 8_000
+  assert 0 < sum(map(len, lines)) <= most_lines
