@@ -226,7 +226,9 @@ def test_the_tutorial_of_a_world_can_be_followed(
     del sys.modules['gate_world']
 
 
-@pytest.mark.parametrize('name', ['your_own_agent', 'your_own_design'])
+@pytest.mark.parametrize(
+    'name', ['your_own_agent', 'your_own_design', 'verdict_by_hand']
+)
 def test_a_notebook_prints_its_stored_output(name, registries, capsys):
   path = _ROOT / 'docs' / 'notebooks' / f'{name}.ipynb'
   notebooks.run(path)

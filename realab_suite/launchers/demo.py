@@ -100,11 +100,11 @@ def _train(folder: pathlib.Path) -> None:
   from realab_suite.engine import arguments
   from realab_suite.lab.experiments import engines
   from realab_suite.lab.experiments import experiment_specs
-  from realab_suite.lab.experiments import result_folders
   from realab_suite.lab.experiments import scheduler
+  from realab_suite.lab.experiments import studies
+  from realab_suite.lab.verdicts import study
   from realab_suite.reports import demonstrations
   from realab_suite.reports import html_page
-  from realab_suite.reports import numbers
 
   experiment = experiment_specs.load(EXPERIMENT)
   program.say(_beginning(experiment.training.steps, folder))
@@ -116,9 +116,9 @@ def _train(folder: pathlib.Path) -> None:
       program.say,
       accept_other_code=accepts,
   )
-  sweep = result_folders.load(folder, accepts)
+  sweep = studies.read_sweep(folder, accepts)
   _film(folder, why_no_film, functools.partial(demonstrations.film, sweep))
-  told = demonstrations.sentences(sweep, numbers.compute(sweep))
+  told = demonstrations.sentences(sweep, study.judge(sweep))
   _say_wrapped(f'\n{" ".join(told)}')
   page = html_page.write(folder, folder, lambda line: None, accepts)
   program.say(f'\nThe report, with learning curves, is {page}\n')
