@@ -178,16 +178,11 @@ def dynamics(domain_name: str, task_name: str) -> tuple[int, str | None]:
   Raises:
     UnknownNameError: If there is no such task.
   """
-  factory = registry.find(domain_name, task_name)
+  version = registry.dynamics_version(domain_name, task_name)
   golden = documents.folder_of_configs() / 'golden.yaml'
   recorded = loading.parse_yaml(golden.read_bytes(), 'golden.yaml')
   digests = recorded.get(mujoco.__version__, {})
-  # Building a task takes longer than reading an attribute of its class.
-  task = getattr(factory, 'func', factory)
-  version = getattr(task, 'DYNAMICS_VERSION', None)
-  if version is None:
-    version = factory().DYNAMICS_VERSION
-  return int(version), digests.get(f'{domain_name}.{task_name}')
+  return version, digests.get(f'{domain_name}.{task_name}')
 
 
 def load(

@@ -1,7 +1,6 @@
 """Action specs, and the split of actions into queries and controls."""
 
-from collections.abc import Collection, Sequence
-import math
+from collections.abc import Sequence
 from typing import Any, final
 
 from dm_control import composer
@@ -35,68 +34,32 @@ class ActionCodec:
 
   def __init__(
       self,
-      control_spec: specs.BoundedArray,
-      query_specs: Sequence[specs.BoundedArray],
-      action_set: action_sets.ActionSet | None,
-      integer_queries: Collection[str] = (),
+      spec: specs.BoundedArray,
+      num_queries: int,
+      table: np.ndarray | None,
   ) -> None:
     """Initializes the codec.
 
     Args:
-      control_spec: Action spec of the task; element names are tab-separated.
-      query_specs: Value spec of each query register.
-      action_set: Discrete actions, or `None` for continuous actions.
-      integer_queries: Names of the query registers that contain the index of
-        an action.
-
-    Raises:
-      SpecError: If the task's action spec is not a bounded vector of numbers.
+      spec: Spec of actions; element names are tab-separated.
+      num_queries: Number of queries with which they begin.
+      table: Controls of each discrete action, `(actions, controls)`; `None` for
+        continuous actions.
     """
-    elements = _element_names(control_spec)
-    self._num_queries = len(query_specs)
-    self._table: np.ndarray | None = None
-    names = [f'query/{spec.name}' for spec in query_specs]
-    low = [float(spec.minimum) for spec in query_specs]
-    high = [float(spec.maximum) for spec in query_specs]
-    is_integer = False
-    if action_set is None:
-      names += elements
-      low += list(np.broadcast_to(control_spec.minimum, control_spec.shape))
-      high += list(np.broadcast_to(control_spec.maximum, control_spec.shape))
-    else:
-      self._table = action_set.table(
-          tuple(name.rpartition('/')[2] for name in elements)
-      )
-      names.append(f'{action_set.name}/v{action_set.version}')
-      low.append(0.0)
-      high.append(len(action_set) - 1.0)
-      is_integer = all(spec.name in integer_queries for spec in query_specs)
-    if is_integer:
-      low, high = [math.ceil(x) for x in low], [math.floor(x) for x in high]
-    self._names = names
-    self._low, self._high = np.array(low, float), np.array(high, float)
+    self._spec, self._num_queries, self._table = spec, num_queries, table
+    self._shape = spec.shape
+    self._names = spec.name.split('\t')
+    self._low, self._high = (
+        np.array(bound, float).reshape(-1)
+        for bound in (spec.minimum, spec.maximum)
+    )
     # An unbounded element accepts any finite number.
     self._is_bounded = bool(np.isfinite([self._low, self._high]).all())
-    self._spec = self._make_spec(np.dtype(np.int32 if is_integer else float))
-    self._shape = self._spec.shape
     # None if actions are not just the number of an action.
-    is_index = isinstance(self._spec, specs.DiscreteArray)
-    self._table_of_indices = self._table if is_index else None
+    is_index = isinstance(spec, specs.DiscreteArray)
+    self._table_of_indices = table if is_index else None
     # Floats are rejected where actions are integers, instead of rounded.
-    self._kinds = 'iu' if is_integer else 'iuf'
-
-  def _make_spec(self, dtype: np.dtype) -> specs.Array:
-    if self._table is not None and not self._num_queries:
-      return specs.DiscreteArray(
-          len(self._table), dtype=dtype, name=self._names[0]
-      )
-    return specs.BoundedArray(
-        self._low.shape,
-        dtype,
-        self._low.astype(dtype),
-        self._high.astype(dtype),
-        name='\t'.join(self._names),
-    )
+    self._kinds = 'iu' if spec.dtype.kind == 'i' else 'iuf'
 
   @property
   def spec(self) -> specs.Array:
@@ -224,14 +187,50 @@ def for_design(
   """Returns the codec for the queries and the action set of a design.
 
   Args:
-    control_spec: Action spec of the task.
+    control_spec: Action spec of the task; element names are tab-separated.
     mechanism: Mechanism that runs the design.
+
+  Raises:
+    SpecError: If the task's action spec is not a bounded vector of numbers.
   """
-  design = mechanism.design
-  spec = design.action_set
-  return ActionCodec(
-      control_spec,
-      [register.value_spec for register in mechanism.queries],
-      spec and action_sets.get(spec.name, spec.version),
-      design.integer_queries(),
+  elements = _element_names(control_spec)
+  queries = [register.value_spec for register in mechanism.queries]
+  names = [f'query/{spec.name}' for spec in queries]
+  chosen = mechanism.design.action_set
+  if chosen is None:
+    spec = _vector(float, [*names, *elements], [*queries, control_spec])
+    return ActionCodec(spec, len(queries), None)
+  action_set = action_sets.get(chosen.name, chosen.version)
+  table = action_set.table(tuple(name.rpartition('/')[2] for name in elements))
+  index_name = f'{action_set.name}/v{action_set.version}'
+  index = specs.DiscreteArray(len(table), dtype=np.int32, name=index_name)
+  if not queries:
+    return ActionCodec(index, 0, table)
+  indices = mechanism.design.integer_queries()
+  dtype = np.int32 if all(one.name in indices for one in queries) else float
+  spec = _vector(dtype, [*names, index_name], [*queries, index])
+  return ActionCodec(spec, len(queries), table)
+
+
+def _vector(
+    dtype: type, names: Sequence[str], parts: Sequence[specs.BoundedArray]
+) -> specs.BoundedArray:
+  """Returns the spec of a vector with the bounds of its parts."""
+  low, high = (
+      np.concatenate(
+          [
+              np.broadcast_to(getattr(part, bound), part.shape).ravel()
+              for part in parts
+          ]
+      )
+      for bound in ('minimum', 'maximum')
+  )
+  if dtype is np.int32:
+    low, high = np.ceil(low), np.floor(high)
+  return specs.BoundedArray(
+      low.shape,
+      dtype,
+      low.astype(dtype),
+      high.astype(dtype),
+      name='\t'.join(names),
   )

@@ -370,11 +370,19 @@ def owners(
 
 
 def settle(physics: Any, named: Iterable[registers.Register]) -> None:
-  """Resets a world and puts registers into the middle of their regions."""
+  """Resets a world and puts registers into the middle of their regions.
+
+  No episode has begun, so registers get the constants of their specs.
+
+  Raises:
+    SpecError: If a register reads anything but values of its spec.
+  """
   mujoco.mj_resetData(physics.model.ptr, physics.data.ptr)
   physics.mark_as_dirty()
   for register in named:
-    register.settle(physics, np.zeros(2), is_initialized=False)
+    register.settle(physics)
+    register.pose(physics, register.initial)
+    register.inspect(physics)  # Refuses a wrong kind before any episode.
   mujoco.mj_kinematics(physics.model.ptr, physics.data.ptr)
 
 

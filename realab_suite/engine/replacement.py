@@ -115,7 +115,8 @@ def _move(
   rotation = rotations.matrices(physics.model.body_quat[frame.element_id])
   displacement = (shift @ rotation)[:2]
   if shift.any():
-    register.settle(physics, displacement)
+    register.move(physics, displacement)
+    register.start(physics)
   for block in register.blocks:
     block.surroundings.shift(displacement)
 

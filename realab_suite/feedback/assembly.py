@@ -73,7 +73,9 @@ def attach(
 ) -> None:
   """Attaches a register to the root entity of a task, or to a mechanism."""
   position = (*place.position, place.height)
-  register.attach_to(root, position, place.yaw, place.spread, place.block)
+  register.attach_to(root, position, place.yaw, place.spread)
+  if place.block is not None:
+    register.borrow(root, place.block)
 
 
 def parts_beside(mechanism: Any) -> dict[str, measurables.Measurable]:

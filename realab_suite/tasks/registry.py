@@ -155,6 +155,21 @@ def find(domain_name: str, task_name: str | None) -> TaskFactory:
   )
 
 
+def dynamics_version(domain_name: str, task_name: str) -> int:
+  """Returns the version of the dynamics of a task.
+
+  It is an attribute of the task's class. A function tells it only by a task
+  that it makes, which takes longer.
+
+  Raises:
+    UnknownNameError: If there is no such task.
+  """
+  factory = find(domain_name, task_name)
+  made = _made(factory)
+  task: Any = made if hasattr(made, 'DYNAMICS_VERSION') else factory()
+  return int(task.DYNAMICS_VERSION)
+
+
 def argument_names(factory: Callable[..., Any]) -> list[str] | None:
   """Returns the names of the keyword arguments that a factory declares.
 

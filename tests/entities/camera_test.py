@@ -68,7 +68,7 @@ def test_a_value_can_be_seen():
         'reward', value_range=(-10, 10), channel=channel
     )
     physics, avatar = _world((register, (1.2, -0.1)))
-    register.settle(physics, np.zeros(2))
+    register.settle(physics)
     views = []
     for value in (0.0, 8.0):
       register.write(physics, value)

@@ -168,7 +168,6 @@ class Register(kinds.Kind):
       position: Sequence[float],
       yaw: float = 0.0,
       spread: Sequence[float] = (0.0, 0.0),
-      block: block_kinds.Block | None = None,
   ) -> None:
     """Attaches the register to the root entity of a task.
 
@@ -181,15 +180,7 @@ class Register(kinds.Kind):
       spread: Half-widths of the region around `position` from which each
         episode draws the start position, `(x, y)` in the register's frame, in
         m.
-      block: Block of the world, in a frame with this position and yaw, that the
-        register uses instead of its own base block. The register then begins
-        where the block does.
-
-    Raises:
-      SpecError: If this kind of register cannot use a block of the world.
     """
-    if block is not None:
-      self.check_can_use_a_block()
     self._spread = np.array(spread, float)
     frame = root.attach(self)
     x, y, height = (*position, 0.0)[:3]
@@ -198,13 +189,26 @@ class Register(kinds.Kind):
       frame.quat = [np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]
     reach = np.array([self._low, self._high]) * self._scale
     low, high = reach[0] - spread[0], reach[1] + spread[0]
-    for own_block in self._blocks:
-      own_block.surroundings.limit(low, high)
-      if isinstance(own_block, block_kinds.PlanarBlock):
-        own_block.stand_at(height)
-    if block is not None:
-      self._use_block(root, block)
-      self._borrowed = block
+    for block in self._blocks:
+      block.surroundings.limit(low, high)
+      if isinstance(block, block_kinds.PlanarBlock):
+        block.stand_at(height)
+
+  def borrow(self, root: composer.Entity, block: block_kinds.Block) -> None:
+    """Uses a block of the world instead of the register's own base block.
+
+    Episodes then begin with the register where the block is.
+
+    Args:
+      root: Root entity of the task, to which the register is attached.
+      block: The block, in a frame with the register's position and yaw.
+
+    Raises:
+      SpecError: If this kind of register cannot use a block of the world.
+    """
+    self.check_can_use_a_block()
+    self._use_block(root, block)
+    self._borrowed = block
 
   def detach_from_root(self) -> None:
     """Undoes `attach_to`."""
@@ -213,49 +217,56 @@ class Register(kinds.Kind):
   def initialize_episode(
       self, physics: protocols.Physics, random_state: np.random.RandomState
   ) -> None:
-    """Draws the start position from the spread and calls `settle`.
+    """Draws the start position from the spread, and applies `initial`.
 
     Composer calls this after the task has initialized the episode.
     """
-    displacement = np.zeros(2)
     if self._spread.any() and self._borrowed is None:
-      displacement = random_state.uniform(-self._spread, self._spread)
-    self.settle(physics, displacement)
+      self.move(physics, random_state.uniform(-self._spread, self._spread))
+    else:
+      self.settle(physics)
+    self.start(physics)
 
-  def settle(
-      self,
-      physics: protocols.Physics,
-      displacement: np.ndarray,
-      is_initialized: bool = True,
-  ) -> None:
-    """Sets the origin that writes are relative to, and applies `initial`.
+  def settle(self, physics: protocols.Physics) -> None:
+    """Sets the origin that writes are relative to: where the first block is.
 
     Args:
       physics: One world or a batch of worlds.
-      displacement: Displacement of the register from its current position, in
-        its own frame, `(2,)`, in m.
-      is_initialized: False if the task has not initialized an episode, so that
-        functions of the task have no value yet; what the kind reads is checked
-        then, and by each later `inspect`.
+    """
+    origin = self._blocks[0].position(physics)
+    self._slots.of(physics).origin[...] = origin
 
-    Raises:
-      SpecError: If the register reads anything but values of its spec.
+  def move(self, physics: protocols.Physics, displacement: np.ndarray) -> None:
+    """Moves the first block, and the origin with it.
+
+    Args:
+      physics: One world or a batch of worlds.
+      displacement: Displacement in the register's frame, `(2,)`, in m.
     """
     first = self._blocks[0]
     origin = np.array(first.position(physics))
-    if displacement.any():
-      origin[..., :2] += displacement
-      first.put(physics, origin)
+    origin[..., :2] += displacement
+    first.put(physics, origin)
     self._slots.of(physics).origin[...] = origin
-    shape = (*origin.shape[:-1], *self._shape)
+
+  def start(self, physics: protocols.Physics) -> None:
+    """Poses the blocks for the value at the start of an episode.
+
+    Args:
+      physics: One world or a batch of worlds, in which the task has initialized
+        the episode.
+
+    Raises:
+      RegisterValueError: If the function of `start_with` fails.
+    """
+    worlds = self._slots.of(physics).origin.shape[:-1]
+    shape = (*worlds, *self._shape)
     initial = np.array(self._initial)
-    if self._measure_initial is not None and is_initialized:
+    if self._measure_initial is not None:
       initial = self._saturated(
           checks.start_value(self._name, self._measure_initial, physics, shape)
       )
     self.pose(physics, np.full(shape, initial))
-    if not is_initialized:
-      self.inspect(physics)  # Refuses a wrong kind before any episode.
 
   def start_with(self, initial: Callable[[protocols.Physics], Any]) -> None:
     """Sets a function that returns the value at the start of each episode.

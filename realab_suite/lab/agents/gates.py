@@ -190,9 +190,12 @@ class Gatekeeper(base.Wrapper):
       options = options.model_copy(update={'gamma': 0.0})
     key = learner.key('update', learner.num_steps // self._setting.num_envs)
     for i in range(-(-num_gradients // each)):
-      trained, _ = learner.updated(
-          trained, base.folded(key, i), options, replay, places, _INJECTED
-      )
+      generator = base.generator_of(base.folded(key, i))
+      begin = q_learning.draw(options, replay, learner.num_stored, generator)
+      if places is not None:
+        _inject(begin, places, generator)
+      samples = q_learning.samples_at(options, replay, *begin)
+      trained, _ = learner.updated(trained, samples)
       self._state['counts']['gradients'] += each
     return trained
 
@@ -224,6 +227,19 @@ class Gatekeeper(base.Wrapper):
     self._state = base.from_plain(self._state, state['gate'])
     if self._trusted is not None:
       self._trusted.set_state(state['trusted'])
+
+
+def _inject(
+    begin: tuple[np.ndarray, np.ndarray],
+    places: tuple[np.ndarray, np.ndarray],
+    generator: np.random.Generator,
+) -> None:
+  """Lets a share of each minibatch begin at some of the places."""
+  num_gradients, minibatch = begin[0].shape
+  size = num_gradients, max(1, int(_INJECTED * minibatch))
+  indices = generator.integers(len(places[0]), size=size)
+  for one, place in zip(begin, places, strict=True):
+    one[:, : size[1]] = place[indices]
 
 
 def _check_fit(gate: gate_settings.Gate, learner: q_learning.QLearning) -> None:

@@ -139,9 +139,10 @@ class QLearning(base.Learner):
         or self.num_stored % options.steps_per_update
     ):
       return
-    self.networks, metrics = self.updated(
-        self.networks, self.update_key(), options, self.replay
-    )
+    generator = base.generator_of(self.update_key())
+    start, world = draw(options, self.replay, self.num_stored, generator)
+    samples = samples_at(options, self.replay, start, world)
+    self.networks, metrics = self.updated(self.networks, samples)
     self._num_updates += 1
     for wrapper in self._wrappers:
       wrapper.follow()
@@ -169,23 +170,16 @@ class QLearning(base.Learner):
     self.num_stored += 1
 
   def updated(
-      self,
-      trained: Any,
-      key: np.ndarray,
-      options: QLearningOptions,
-      replay: Any,
-      places: tuple[np.ndarray, np.ndarray] | None = None,
-      share: float = 0.0,
+      self, trained: Any, samples: dict[str, Any]
   ) -> tuple[Any, dict[str, Any]]:
     """Returns networks, with their optimisers' states, after an update.
 
-    The metrics of the update are the second result. `key` is a random key of
-    two numbers, and what follows it is as in `sample`.
+    The metrics of the update are the second result; `samples` are minibatches,
+    as from `samples_at`.
     """
-    generator = base.generator_of(key)
-    samples = sample(options, replay, self.num_stored, generator, places, share)
-    samples['total'] /= np.float32(self.scale.value)
-    return _update(self._options, self._encoder, trained, samples)
+    total = samples['total'] / np.float32(self.scale.value)
+    minibatches = {**samples, 'total': total}
+    return _update(self._options, self._encoder, trained, minibatches)
 
   def _memory(self) -> dict[str, Any]:
     filled = min(self.num_stored, self.num_slots)
@@ -206,33 +200,23 @@ class QLearning(base.Learner):
     self.replay = jax.tree.map(grow, memory['replay'])
 
 
-def sample(
+def draw(
     options: QLearningOptions,
     replay: Any,
     num_stored: int,
     generator: np.random.Generator,
-    places: tuple[np.ndarray, np.ndarray] | None = None,
-    share: float = 0.0,
-) -> dict[str, Any]:
-  """Draws minibatches of n-step returns from the replay.
-
-  Sums of readings end at the end of an episode, or after
-  `options.num_returns` steps.
+) -> tuple[np.ndarray, np.ndarray]:
+  """Draws transitions of the replay, at which samples begin.
 
   Args:
     options: Options of the learner.
     replay: Transitions, each array `(slots, worlds, ...)`.
     num_stored: Number of transitions of each world that were ever stored.
     generator: Random generator.
-    places: Slots and worlds in which a share of each minibatch begins, or
-      `None`.
-    share: That share.
 
   Returns:
-    Arrays `(gradients, minibatch, ...)`: the `observation`, the `action`, the
-    discounted sum of readings after it (`total`), the observation at the end of
-    the sum (`later`), the discount of its value (`factor`), and a `weight` that
-    is 0 for samples without a valid reading.
+    Their numbers in their worlds, and the worlds, each `(gradients,
+    minibatch)`.
   """
   num_slots, num_envs = replay['reading'].shape
   shape = (options.gradients_per_update, options.minibatch)
@@ -240,12 +224,28 @@ def sample(
   ages = generator.integers(
       options.num_returns + 1, min(num_stored, num_slots) + 1, shape
   )
-  start = num_stored - ages
-  world = generator.integers(num_envs, size=shape)
-  if places is not None:
-    size = shape[0], max(1, int(share * shape[1]))
-    indices = generator.integers(len(places[0]), size=size)
-    start[:, : size[1]], world[:, : size[1]] = (x[indices] for x in places)
+  return num_stored - ages, generator.integers(num_envs, size=shape)
+
+
+def samples_at(
+    options: QLearningOptions,
+    replay: Any,
+    start: np.ndarray,
+    world: np.ndarray,
+) -> dict[str, Any]:
+  """Returns samples of n-step returns, which begin at given transitions.
+
+  Sums of readings end at the end of an episode, or after
+  `options.num_returns` steps. `start` has the numbers or slots of transitions,
+  and `world` their worlds, each `(...)`; the rest is as in `draw`.
+
+  Returns:
+    Arrays `(..., ...)`: the `observation`, the `action`, the discounted sum of
+    readings after it (`total`), the observation at the end of the sum
+    (`later`), the discount of its value (`factor`), and a `weight` that is 0
+    for samples without a valid reading.
+  """
+  num_slots, shape = len(replay['reading']), start.shape
   total, factor = np.zeros(shape, np.float32), np.ones(shape, np.float32)
   is_running, length = np.ones(shape, bool), np.zeros(shape, int)
   for i in range(options.num_returns):

@@ -166,9 +166,8 @@ def test_sums_of_readings_stop_at_the_end_of_an_episode():
   options = q_learning.QLearningOptions(
       kind='q_learning', reward='r', gamma=0.5, num_returns=2, minibatch=400
   )
-  samples = q_learning.sample(
-      options, replay, num_stored=8, generator=np.random.default_rng(0)
-  )
+  begin = q_learning.draw(options, replay, 8, np.random.default_rng(0))
+  samples = q_learning.samples_at(options, replay, *begin)
   got = {}
   for action, total, factor, later, weight in zip(
       samples['action'].ravel(),
