@@ -79,7 +79,7 @@ def _told(design, *steps, end=events.End.TIMEOUT, actions=(), objective=None):
 
 
 _READ, _WRITE = streams.read, streams.write
-_RETURN, _, _MEAN, _AGREEMENT = _DESIGNS
+_RETURN, _THREE, _MEAN, _AGREEMENT = _DESIGNS
 
 
 def test_returns_means_and_agreements_by_hand():
@@ -106,6 +106,18 @@ def test_returns_means_and_agreements_by_hand():
       for reading, clean in ((1.0, 1.0), (5.0, 1.0))
   ]).objective.values()  # fmt: skip
   assert value == gains.Value(observed=1.5, clean=0.5)
+  found = _told(_THREE, [
+      _READ(3.0, 0.0, parts=(0.0, 0.0, 3.0)),
+      _READ(4.0, 0.0, 'q', parts=(0.0, 4.0, 0.0)), _READ(2.0, register='s'),
+  ])  # fmt: skip
+  # -3 + 2 * 4 + 0.5 * 2; the corruption is that of `r`, 3 x 0.5 m.
+  assert found.objective == {
+      'return': gains.Value(observed=6.0, clean=1.0),
+      'return of r': gains.Value(observed=-3.0, clean=0.0),
+      'return of q': gains.Value(observed=8.0, clean=0.0),
+      'return of s': gains.Value(observed=1.0, clean=1.0),
+  }
+  assert (found.corruption, found.observed_return) == (1.5, 7.0)
   # Labels 1.4 and 99 are decoded as 1 and 13; the actions follow the query.
   [value] = _told(
       _AGREEMENT,
@@ -158,22 +170,24 @@ def test_the_largest_own_corruption_of_the_readers_counts_in_each_step():
       [_READ(0.0)],
       [
           _READ(1.0, 0.0, 'm', 'p', (0.0, 1.0, 0.0)),
-          _READ(3.0, 0.0, 'm', 'p', (0.0, 0.0, 3.0)),
+          _READ(3.0, 0.0, 'm', 'p', (1.0, 0.0, 2.0)),
           _READ(0.0),
       ],
   )
   one = found.registers['m']
   assert (one.own, one.inherited, one.corruption) == (0.3125, 0.0, 0.3125)
-  assert (one.permanent, one.temporary) == (0.0, 0.3125)
+  assert (one.obstruction, one.permanent, one.temporary) == (0.0625, 0.0, 0.25)
 
 
-def test_what_is_read_at_a_reset_is_covered():
+def test_what_is_read_at_a_reset_is_covered_and_no_part_of_sums():
   monitor = streams.monitor(_RETURN)
-  reset = [streams.initial(0.0), _READ(0.0)]
+  reset = [streams.initial(0.0), _READ(7.0, 0.0, parts=(0.0, 7.0, 0.0))]
   quiet = [_READ(0.0, register=name) for name in ('q', 'r', 's')]
   streams.tell(monitor, [reset, [_WRITE(1.0), _WRITE(0.0), *quiet]])
   [found] = monitor.take()
-  assert found.registers['r'].coverage == 2 / 3
+  one = found.registers['r']
+  assert (one.coverage, one.observed, one.corruption) == (2 / 3, 0.0, 0.0)
+  assert (found.observed_return, found.objective['return'].gain) == (0.0, 0.0)
 
 
 def test_negligible_displacements_are_zero():
