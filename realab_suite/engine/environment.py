@@ -554,18 +554,14 @@ class WorldEnvironment(Environment):
     self._host = hosts.WorldHost(task)
     super().__init__(task, mechanism, **options)
     self._host.call_hooks(self._hooks, self._random_state)
-    self._start_check = placement.StartCheck(self._physics, task, mechanism)
+    self._placement = placement.Placement(self._physics, task, mechanism)
 
   def check_placement(self) -> None:
     self._refuse_if_closed()
-    physics, mechanism = self._physics, self._mechanism
-    surveyed = self._start_check.surveyed
-    surveyed = surveyed or placement.survey(physics, mechanism, True)
-    placement.check(physics, self._task.root_entity, mechanism, surveyed)
-    placement.check_start(physics, self._task, surveyed)
+    self._placement.check(self._physics)
 
   def check_start(self, physics: Any) -> None:
-    self._start_check(physics)
+    self._placement.check_start(physics)
 
   def _run(
       self, queries: np.ndarray, controls: np.ndarray

@@ -76,7 +76,22 @@ class ForeignEnvironment(environment.Environment):
     placement.check(self._physics, self._task.root_entity, self._mechanism)
 
   def check_start(self, physics: Any) -> None:
-    check_start(physics, self._mechanism)
+    owners = clearance.owners(physics, self._mechanism.registers)
+    model, contacts = physics.model, physics.data.ptr.contact
+    depths = -contacts.dist
+    for (first, second), depth in zip(contacts.geom, depths, strict=True):
+      block, body = (first, second) if first in owners else (second, first)
+      if block not in owners or body in owners:
+        continue
+      if model.geom_type[body] == mujoco.mjtGeom.mjGEOM_HFIELD:
+        continue  # Uneven ground, which lifts a block.
+      if depth > clearance.TOLERANCE:
+        name = model.id2name(int(body), 'geom') or f'geom {body}'
+        raise composer.EpisodeInitializationError(
+            f'design {self._mechanism.design.name!r}: register'
+            f' {owners[block]!r} would be {depth:.2g} m inside {name!r} when'
+            ' the episode begins; place it elsewhere'
+        )
 
   @contextlib.contextmanager
   def _initializing(self) -> Iterator[None]:
@@ -202,36 +217,6 @@ class ForeignEnvironment(environment.Environment):
         self._task.physics_steps_per_control_step,
         strip_singleton_buffer_dim=True,
     )
-
-
-def check_start(
-    physics: mjcf.Physics, mechanism: mechanisms.FeedbackMechanism
-) -> None:
-  """Checks that no episode begins with something inside a register.
-
-  Args:
-    physics: Physics at the start of an episode.
-    mechanism: Registers, meters and providers.
-
-  Raises:
-    EpisodeInitializationError: If something is. The next attempt draws other
-      positions.
-  """
-  owners = clearance.owners(physics, mechanism.registers)
-  model, contacts = physics.model, physics.data.ptr.contact
-  for (first, second), depth in zip(contacts.geom, -contacts.dist, strict=True):
-    block, body = (first, second) if first in owners else (second, first)
-    if block not in owners or body in owners:
-      continue
-    if model.geom_type[body] == mujoco.mjtGeom.mjGEOM_HFIELD:
-      continue  # Uneven ground, which lifts a block.
-    if depth > clearance.TOLERANCE:
-      name = model.id2name(int(body), 'geom') or f'geom {body}'
-      raise composer.EpisodeInitializationError(
-          f'design {mechanism.design.name!r}: register {owners[block]!r} would'
-          f' be {depth:.2g} m inside {name!r} when the episode begins; place it'
-          ' elsewhere'
-      )
 
 
 def hint(given: Any) -> str:

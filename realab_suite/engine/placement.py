@@ -96,59 +96,13 @@ def check(
     placed.append(blocks)
 
 
-def check_start(
-    physics: mjcf.Physics, task: base.Task, surveyed: clearance.Survey
-) -> None:
-  """Checks that no episode begins with something movable inside a block.
-
-  This covers every position of the avatar, and other bodies where the compiled
-  model has them; `StartCheck` checks where episodes put them.
-
-  Args:
-    physics: Physics of one world.
-    task: Task of this package.
-    surveyed: The survey of the world, in the whole regions of registers.
-
-  Raises:
-    SpecError: If a block could overlap the avatar or another body when an
-      episode begins.
-  """
-  space = surveyed.space
-  bodies = surveyed.select(_movable(physics, task, surveyed))
-  # A geom of the avatar represents all initial positions of its centre.
-  low, high = np.array(task.start.low), np.array(task.start.high)
-  avatar = physics.model.body_geomadr[physics.bind(task.avatar.body).element_id]
-  is_avatar = np.arange(physics.model.ngeom) == avatar
-  start = surveyed.select(is_avatar)._replace(
-      centres=np.array([[*(low + high) / 2, 0.0]]),
-      axes=np.eye(3)[np.newaxis],
-      halves=np.array([[*(high - low) / 2 + _THIN, 1.0]]),
-      is_box=np.ones(1, bool),
-  )
-  least = task.avatar.radius - clearance.TOLERANCE
-  for name, blocks in surveyed.starts.items():
-    problems = [
-        (i, 'where the avatar begins')
-        for i in range(len(blocks.geoms))
-        if space.distance(blocks, i, start, 0, least) < least
-    ] + [
-        (i, f'inside {bodies.names[j]!r} when an episode begins')
-        for i, j in space.meetings(blocks, bodies)
-    ]
-    for i, problem in problems:
-      raise errors.SpecError(
-          f'register {name!r} {blocks.describe(i)}, {problem}; place it'
-          ' elsewhere'
-      )
-
-
 @final
-class StartCheck:
-  """Check of the start of an episode, for one world or a world of a batch.
+class Placement:
+  """Checks of the registers in a task of this package.
 
   A task may move walls and other parts at the start of an episode, and put
-  bodies somewhere. The check costs next to nothing in worlds where all parts
-  are where the compiled model has them.
+  bodies somewhere. The check of an episode costs next to nothing in worlds
+  where all parts are where the compiled model has them.
   """
 
   def __init__(
@@ -164,10 +118,7 @@ class StartCheck:
       task: Task of this package, with `mechanism` attached.
       mechanism: Registers, meters and providers.
     """
-    self._design = mechanism.design.name
-    self._root = task.root_entity
-    self._registers = mechanism.registers
-    self._is_spread = any(r.spread.any() for r in self._registers.values())
+    self._task, self._mechanism = task, mechanism
     self._survey = surveyed = survey(physics, mechanism)
     self._movable = _movable(physics, task, surveyed)
     carriers = physics.model.body_weldid[physics.model.geom_bodyid]
@@ -177,20 +128,50 @@ class StartCheck:
     self._mocap = np.unique(model.body_mocapid[carriers[self._homes.geoms]])
     self._home_poses = _mocap_poses(data, self._mocap)
     bodies = surveyed.select(self._movable)
-    self._is_needed = bool(self._registers) and bool(
+    self._is_needed = bool(mechanism.registers) and bool(
         len(self._homes.geoms) + len(bodies.geoms)
     )
 
-  @property
-  def surveyed(self) -> clearance.Survey | None:
-    """The survey of the world; `None` if a register is placed in a region."""
-    return None if self._is_spread else self._survey
+  def check(self, physics: mjcf.Physics) -> None:
+    """Checks the whole regions of registers, before the first episode.
 
-  def __call__(self, physics: Any) -> None:
+    Besides what `check` refuses, nothing movable may begin inside a block: the
+    avatar in any of its positions, and other bodies where the compiled model
+    has them.
+
+    Args:
+      physics: Physics of the world, whose state may be reset.
+
+    Raises:
+      SpecError: If something is in the way of a register.
+    """
+    mechanism, surveyed = self._mechanism, self._survey
+    if any(one.spread.any() for one in mechanism.registers.values()):
+      surveyed = survey(physics, mechanism, is_spread=True)
+    check(physics, self._task.root_entity, mechanism, surveyed)
+    space, bodies = surveyed.space, surveyed.select(self._movable)
+    start = _start_of_avatar(physics, self._task, surveyed)
+    least = self._task.avatar.radius - clearance.TOLERANCE
+    for name, blocks in surveyed.starts.items():
+      problems = [
+          (i, 'where the avatar begins')
+          for i in range(len(blocks.geoms))
+          if space.distance(blocks, i, start, 0, least) < least
+      ] + [
+          (i, f'inside {bodies.names[j]!r} when an episode begins')
+          for i, j in space.meetings(blocks, bodies)
+      ]
+      for i, problem in problems:
+        raise errors.SpecError(
+            f'register {name!r} {blocks.describe(i)}, {problem}; place it'
+            ' elsewhere'
+        )
+
+  def check_start(self, physics: Any) -> None:
     """Checks an episode that has just been initialized.
 
     Args:
-      physics: Physics of one world.
+      physics: Physics of this world, or of a world of a batch.
 
     Raises:
       EpisodeInitializationError: If something is inside a register. The next
@@ -210,8 +191,8 @@ class StartCheck:
     is_moved |= (parts.axes != self._homes.axes).any(axis=(1, 2))
     if not len(bodies.geoms) + is_moved.sum():
       return
-    parts = _along_ways(physics, self._root, parts.only(is_moved))
-    for name, register in self._registers.items():
+    parts = _along_ways(physics, self._task.root_entity, parts.only(is_moved))
+    for name, register in self._mechanism.registers.items():
       blocks = self._survey.starts[name]
       shift = data.geom_xpos[blocks.geoms[0]] - blocks.centres[0]
       self._refuse(register, self._survey.paths[name].moved(shift), parts)
@@ -224,7 +205,7 @@ class StartCheck:
     """Raises an error if a block of a register is inside something."""
     for i, j in self._survey.space.meetings(blocks, obstacles):
       raise composer.EpisodeInitializationError(
-          f'design {self._design!r}: register {register.name!r}'
+          f'design {self._mechanism.design.name!r}: register {register.name!r}'
           f' {blocks.describe(i)}, inside {obstacles.names[j]!r} when the'
           ' episode begins; place the register elsewhere, narrow its range, or'
           ' keep the other away'
@@ -243,6 +224,21 @@ def _movable(
   avatar = int(physics.bind(task.avatar.body).element_id)
   return surveyed.others(
       ~surveyed.space.is_fixed & (roots != model.body_rootid[avatar])
+  )
+
+
+def _start_of_avatar(
+    physics: mjcf.Physics, task: base.Task, surveyed: clearance.Survey
+) -> clearance.Shapes:
+  """Returns a geom of the avatar, as big as all starts of its centre."""
+  low, high = np.array(task.start.low), np.array(task.start.high)
+  avatar = physics.model.body_geomadr[physics.bind(task.avatar.body).element_id]
+  is_avatar = np.arange(physics.model.ngeom) == avatar
+  return surveyed.select(is_avatar)._replace(
+      centres=np.array([[*(low + high) / 2, 0.0]]),
+      axes=np.eye(3)[np.newaxis],
+      halves=np.array([[*(high - low) / 2 + _THIN, 1.0]]),
+      is_box=np.ones(1, bool),
   )
 
 

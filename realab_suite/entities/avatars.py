@@ -158,9 +158,7 @@ class Avatar(measurables.MeasurableEntity):
         self._body.add('site', name='rays', pos=(0, 0, RAY_HEIGHT), group=4),
     )
     self._physics: protocols.Physics | None = None
-    self._blocks: list[block_kinds.Block] = []
-    self._grasps: list[grasps.Grasp] = []
-    self._constraints: tuple[mjcf.Element, ...] = ()
+    self._grasps: dict[block_kinds.Block, grasps.Grasp] = {}
     self._pairs: list[mjcf.Element] = []
 
   def _add_actuators(self) -> None:
@@ -290,33 +288,34 @@ class Avatar(measurables.MeasurableEntity):
     Args:
       blocks: Blocks of registers.
     """
-    root = self._mjcf_root.root_model
     for block in blocks:
-      if (softness := block_contacts.softness(block.half_size)) > 1.0:
-        time, damping = _CONTACT['solref']
-        slip, spin, roll = _CONTACT['friction']
-        pair = root.contact.add(
-            'pair',
-            geom1=self._torso,
-            geom2=block.geom,
-            condim=3,
-            solref=(time * softness, damping),
-            friction=(slip, slip, spin, roll, roll),
-        )
-        self._pairs.append(pair)
-      grasp = grasps.Grasp(
+      self._soften_contact(block)
+      self._grasps[block] = grasps.Grasp(
           self._hand, block.site, self._hand_position, block.turns_along
       )
-      block.grasps.append(grasp)
-      self._grasps.append(grasp)
-      self._blocks.append(block)
-    self._constraints = grasps.constraints_of(self._grasps)
+      block.grasps.append(self._grasps[block])
     self._physics = None
+
+  def _soften_contact(self, block: block_kinds.Block) -> None:
+    """Makes contacts of the body with a block softer, if the block is large."""
+    if (softness := block_contacts.softness(block.half_size)) <= 1.0:
+      return
+    time, damping = _CONTACT['solref']
+    slip, spin, roll = _CONTACT['friction']
+    pair = self._mjcf_root.root_model.contact.add(
+        'pair',
+        geom1=self._torso,
+        geom2=block.geom,
+        condim=3,
+        solref=(time * softness, damping),
+        friction=(slip, slip, spin, roll, roll),
+    )
+    self._pairs.append(pair)
 
   @property
   def graspable(self) -> Sequence[block_kinds.Block]:
     """Blocks that the hand can grasp, in the order in which they were added."""
-    return tuple(self._blocks)
+    return tuple(self._grasps)
 
   def forget(self, blocks: Sequence[block_kinds.Block]) -> None:
     """Undoes `make_graspable` for the given blocks."""
@@ -324,13 +323,10 @@ class Avatar(measurables.MeasurableEntity):
     for pair in [p for p in self._pairs if p.geom2 in geoms]:
       self._pairs.remove(pair)
       pair.remove()
-    for block in [b for b in self._blocks if b in blocks]:
-      i = self._blocks.index(block)
-      grasp = self._grasps.pop(i)
-      self._blocks.pop(i)
+    for block in [b for b in self._grasps if b in blocks]:
+      grasp = self._grasps.pop(block)
       block.grasps.remove(grasp)
       grasp.remove()
-    self._constraints = grasps.constraints_of(self._grasps)
     self._physics = None
 
   def place(
@@ -361,7 +357,7 @@ class Avatar(measurables.MeasurableEntity):
       physics: One world or a batch of worlds.
       where: Worlds in which to do so, `(...)` bool; `None` for all worlds.
     """
-    for grasp in self._grasps:
+    for grasp in self._grasps.values():
       grasp.release(physics, where)
 
   def apply_action(
@@ -432,7 +428,7 @@ class Avatar(measurables.MeasurableEntity):
     body[..., 6] = sin
     body[..., 7] = pitch
     body[..., 8] = 0.0
-    if self._constraints:
+    if self._grasps:
       active = self._holds.active
       body[..., 8] = np.logical_or.reduce(active, axis=-1)
     return body
@@ -442,7 +438,7 @@ class Avatar(measurables.MeasurableEntity):
     self._motors = physics.bind(self._actuators)
     self._moved = physics.bind(self._slides)
     self._posture = physics.bind(self._joints)
-    self._holds = physics.bind(self._constraints)
+    self._holds = physics.bind(grasps.constraints_of(self._grasps.values()))
     self._physics = physics
 
   def _use_hand(
@@ -456,7 +452,7 @@ class Avatar(measurables.MeasurableEntity):
       return  # The most frequent case: no block to throw or to release.
     held = grasps.held(active)
     hand = physics.bind(self._hand).xpos
-    sites = [block.site for block in self._blocks]
+    sites = [block.site for block in self._grasps]
     offsets = physics.bind(sites).xpos - hand[..., np.newaxis, :]
     squares = offsets * offsets
     # The hand grasps a block in front of it at any height.
@@ -476,7 +472,7 @@ class Avatar(measurables.MeasurableEntity):
     throws = (np.asarray(throw) >= 0.5)[..., np.newaxis]
     drops = (np.asarray(grasp) <= -0.5)[..., np.newaxis] | throws
     released = held & drops & ~throws
-    for i, block in enumerate(self._blocks):
+    for i, block in enumerate(self._grasps):
       is_written = block.written_slot.get(physics) > 0
       held[..., i] &= (distances[..., i] <= _SLIPS) | is_written
       block.written_slot.set(physics, 0.0)
@@ -484,16 +480,16 @@ class Avatar(measurables.MeasurableEntity):
       direction = self.direction(physics)
       lift = np.full((*direction.shape[:-1], 1), _THROW_LIFT)
       velocity = np.concatenate([_THROW_SPEED * direction, lift], axis=-1)
-      for i, block in enumerate(self._blocks):
+      for i, block in enumerate(self._grasps):
         block.launch(physics, velocity, thrown[..., i])
     # In a batch, hands can throw in some worlds and release in others.
     if released.any():
       velocity = self._hand_velocity(physics)
-      for i, block in enumerate(self._blocks):
+      for i, block in enumerate(self._grasps):
         block.slow_down(physics, velocity, released[..., i])
     is_held = (held | takes) & ~drops
     constraints.active = grasps.active(is_held, distances)
-    for i, grasp_of_block in enumerate(self._grasps):
+    for i, grasp_of_block in enumerate(self._grasps.values()):
       grasp_of_block.turn_along(physics, is_held[..., i])
 
   def _hand_position(self, physics: protocols.Physics) -> np.ndarray:

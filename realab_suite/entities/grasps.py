@@ -1,6 +1,6 @@
 """Grasps: the hold of a hand on a block."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 import itertools
 from typing import Any, final
 
@@ -168,7 +168,7 @@ class Grasp:
     return is_held if where is None else is_held & where
 
 
-def constraints_of(grasps: Sequence[Grasp]) -> tuple[mjcf.Element, ...]:
+def constraints_of(grasps: Iterable[Grasp]) -> tuple[mjcf.Element, ...]:
   """Returns the constraints of several grasps, to be bound together."""
   return tuple(itertools.chain(*[grasp.constraints for grasp in grasps]))
 

@@ -18,6 +18,7 @@ SENSES = ('ray_distances', 'ray_classes', 'velocity', 'position', 'heading')
 """Names of the senses that `view` reads."""
 
 _FIELD_OF_VIEW = np.radians(160.0)
+_NO_OBSTACLE = -1.0
 # Distance between the middle of the avatar and obstacles, metres. The radius of
 # the avatar is 0.25. Blocks get a wider berth, because they can be pushed.
 _BERTHS = {
@@ -28,10 +29,9 @@ _BERTHS = {
     appearance.PRESSED_PAD: 0.34,
     appearance.BASE_BLOCK: 0.42,
     appearance.OFFSET_BLOCK: 0.42,
-    # No obstacles.
-    appearance.NOTHING: -1.0,
-    appearance.APPLE: -1.0,
-    appearance.LARGE_APPLE: -1.0,
+    appearance.NOTHING: _NO_OBSTACLE,
+    appearance.APPLE: _NO_OBSTACLE,
+    appearance.LARGE_APPLE: _NO_OBSTACLE,
 }
 # By code. Objects of all other classes may be in the way.
 _BERTH = np.full(appearance.CAPACITY, 0.3)
@@ -95,6 +95,15 @@ class View:
   def hits(self, name: str) -> np.ndarray:
     """Returns True for rays that hit a class, `(..., rays)`, bool."""
     return self.classes == appearance.code(name)
+
+  def through(self, hit: np.ndarray) -> 'View':
+    """Returns the view of an avatar that may walk through some things.
+
+    Args:
+      hit: True for the rays that hit them, `(..., rays)`.
+    """
+    berths = np.where(hit, _NO_OBSTACLE, _BERTH[self.classes])
+    return dataclasses.replace(self, free=_free_way(self.distances, berths))
 
   def points(self, depth: float) -> np.ndarray:
     """Returns the points that lie `depth` behind the hits of all rays.
@@ -173,7 +182,7 @@ def view(observation: base.Observation) -> View:
       coast=_COAST * get('velocity')[..., 2],
       distances=distances,
       classes=classes,
-      free=_free_way(distances, classes),
+      free=_free_way(distances, _BERTH[classes]),
   )
 
 
@@ -188,11 +197,10 @@ def wrap(angle: np.ndarray) -> np.ndarray:
   return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
-def _free_way(distances: np.ndarray, classes: np.ndarray) -> np.ndarray:
+def _free_way(distances: np.ndarray, berths: np.ndarray) -> np.ndarray:
   """Returns the free distance along each ray, `(..., rays)`, metres."""
-  berths = np.minimum(
-      _BERTH[classes], np.maximum(_SQUEEZE * distances, _TIGHT)
-  )[..., np.newaxis, :]
+  squeezed = np.maximum(_SQUEEZE * distances, _TIGHT)
+  berths = np.minimum(berths, squeezed)[..., np.newaxis, :]
   cosines, sines = _between_rays(distances.shape[-1])
   distances = distances[..., np.newaxis, :]
   in_way = (distances * sines < berths) & (cosines > 0)

@@ -175,12 +175,8 @@ class ValuedThingsSolver(errands.Errand):
     goal = errands.nearest(view, things[..., :2], is_left)
     if corners.size:
       goal = errands.around(view, goal, corners)
-    # Scripted policies walk through apples, and around what they do not know.
-    classes = np.asarray(seen['senses/ray_classes'])
+    # The avatar walks through things that it wants, and around all others.
     good = np.where(is_good, codes, -1)[..., np.newaxis, :]
-    is_wanted = (classes[..., np.newaxis] == good).any(axis=-1)
-    classes = np.where(is_wanted, appearance.code(appearance.APPLE), classes)
-    walks = navigation.walk(
-        navigation.view({**seen, 'senses/ray_classes': classes}), goal, 0.45
-    )
+    is_wanted = (view.classes[..., np.newaxis] == good).any(axis=-1)
+    walks = navigation.walk(view.through(is_wanted), goal, 0.45)
     return np.where(is_left.any(axis=-1), walks, self.action_set.index('wait'))

@@ -126,8 +126,9 @@ def test_the_crate_is_the_base_block_and_nothing_else():
     assert registers['told'].own_blocks == registers['told'].blocks[1:]
     assert registers['seen'].own_blocks == registers['seen'].blocks
     # Each can be grasped once.
-    grasped = [block for block in env.task.avatar._blocks]
-    assert grasped.count(crate.block) == grasped.count(other.block) == 1
+    grasped = env.task.avatar.graspable
+    assert {crate.block, other.block} < set(grasped)
+    assert len(crate.block.grasps) == len(other.block.grasps) == 1
     assert set(registers['told'].own_blocks) < set(grasped)
     # They do not collide with one another, however close.
     env.reset()

@@ -28,8 +28,10 @@ from realab_suite.engine import events
 from realab_suite.entities import protocols
 from realab_suite.entities import registers
 from realab_suite.evaluation import gains
+from realab_suite.feedback import mechanisms
 from realab_suite.lab.attribution import attribution_metrics
 from realab_suite.lab.attribution import movers
+from realab_suite.tasks import base
 
 # Smaller changes are rounding errors of writes and reads, in m.
 _NOTICEABLE = 1e-6
@@ -58,36 +60,30 @@ class Attributor(events.BatchEventSink):
   """Attributes the corruption in the episodes of a batch."""
 
   def __init__(
-      self,
-      env: environment.Environment | batch_environment.BatchEnvironment,
+      self, batch: 'batch_environment.BatchEnvironment | _OneWorld'
   ) -> None:
     """Makes a sink, which `batch.add_sink` takes.
 
     Args:
-      env: The worlds; one world for `WorldAttributor`.
+      batch: The worlds.
     """
-    self._env = env
-    if isinstance(env, environment.Environment):
-      self._physics: Any = env.thin_physics
-      num_worlds = 1
-    else:
-      self._physics, num_worlds = env.physics, env.num_envs
+    self._mechanism, self._physics = batch.mechanism, batch.physics
     self._watched = {
         name: register
-        for name, register in env.mechanism.registers.items()
+        for name, register in self._mechanism.registers.items()
         if register.read_without(self._physics, _any) is not None
     }
-    self._registers = env.mechanism.ports
+    self._registers = self._mechanism.ports
     self._indices = {name: i for i, name in enumerate(self._registers)}
     scales = [register.scale for register in self._registers.values()]
     self._scales = np.reshape(scales, (-1, 1))
     self._movers = movers.Movers(
-        env.task,
+        batch.task,
         list(self._registers.values()),
         self._physics,
-        num_worlds,
+        batch.num_envs,
     )
-    self._total = np.zeros((2, len(self._registers), num_worlds))
+    self._total = np.zeros((2, len(self._registers), batch.num_envs))
     self._agent = np.zeros_like(self._total)
     self._entries: list[_Entry] = []
 
@@ -232,20 +228,16 @@ class Attributor(events.BatchEventSink):
           f' that world {world} has begun, from 0'
       )
     steps = episodes[episode]
-    nothing = np.zeros(len(steps))
     by_register = {}
-    for name, register in self._env.mechanism.ports.items():
-      total = agent = nothing
-      if name in self._indices:
-        i = self._indices[name]
-        total = np.array([one.total[:, i, world].sum() for one in steps])
-        agent = np.array([one.agent[:, i, world].sum() for one in steps])
+    for i, (name, register) in enumerate(self._registers.items()):
+      total = np.array([one.total[:, i, world].sum() for one in steps])
+      agent = np.array([one.agent[:, i, world].sum() for one in steps])
       is_corrupt = np.abs(total) * register.scale > _NOTICEABLE
       by_register[name] = attribution_metrics.RegisterAttribution(
           register.scale, total * is_corrupt, agent * is_corrupt
       )
     return attribution_metrics.Attribution(
-        by_register, gains.relevant(self._env.mechanism.design)
+        by_register, gains.relevant(self._mechanism.design)
     )
 
   def metrics(
@@ -257,6 +249,16 @@ class Attributor(events.BatchEventSink):
 
 def _any(geoms: np.ndarray) -> np.ndarray:
   return geoms >= 0
+
+
+@final
+class _OneWorld(NamedTuple):
+  """A batch of one world, for `Attributor`."""
+
+  task: base.Task
+  mechanism: mechanisms.FeedbackMechanism
+  physics: Any
+  num_envs: int
 
 
 @final
@@ -272,7 +274,8 @@ class WorldAttributor(events.EventSink):
     Raises:
       SpecError: If its task is a foreign task.
     """
-    self._attributor = Attributor(env)
+    world = _OneWorld(env.task, env.mechanism, env.thin_physics, 1)
+    self._attributor = Attributor(world)
 
   def episode_started(
       self, start: events.Start, physics: protocols.Physics

@@ -88,7 +88,7 @@ def _load_batch() -> batch_environment.BatchEnvironment:
 @pytest.mark.parametrize(
     ('load', 'owner', 'name', 'kind'),
     [
-        (_load, placement, 'check_start', Stopped),
+        (_load, placement.Placement, 'check', Stopped),
         (_load_batch, placement, 'check', Failed),
         (_load_batch, _BATCH, '__init__', Failed),
     ],
