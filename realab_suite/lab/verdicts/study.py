@@ -593,7 +593,8 @@ class _Case:
 
   def _obstacles(self, rows: _Rows, stake: stakes.Stakes) -> list[str]:
     """Returns reasons against a favourable judgement on some of the rows."""
-    design, twin = self._run.design, self._twin
+    design = self._run.design
+    twin = self._twin if self._run.role is Role.AGENT else None
     _, control = self._study.control(self._run)
     ranges = {
         name: design.ports[name].range for name in gains.unconsumed(design)
