@@ -238,6 +238,8 @@ def _switched(*signals, end=events.End.TIMEOUT):
         ([(0.0, 0.0), (9.0, 9.0)], 'signal', 2, 2, False),
         # Pushed.
         ([(0.0, 0.0), (9.0, 0.0)], 'signal', 2, 2, True),
+        # Another signal has ended it.
+        ([(0.0, 0.0), (0.0, 0.0)], 'signal', 2, 2, False),
         # Pushed in vain: the time was over, or the task ended the episode.
         ([(0.0, 0.0), (9.0, 0.0)], 'terminated', 2, 2, False),
         # Unknown: neither is certain, and so the gain is not.
