@@ -16,7 +16,6 @@ from realab_suite.engine import environment
 from realab_suite.engine import seeding
 from realab_suite.feedback import mechanisms
 from realab_suite.feedback import specs
-from realab_suite.policies import action_sets
 from realab_suite.policies import random_keys
 
 # A function from a time step to an action, as in dm_control's viewer.
@@ -86,23 +85,17 @@ class PolicyRunner(abc.ABC):  # noqa: B024 - A subclass begins episodes.
     """
     self._privileged = PrivilegedSenses(policy, env)
     self._policy = policy = policy.in_action_set(env.action_set)
-    mechanism = env.mechanism
-    design = mechanism.design
-    self._action_set = policy.action_set
-    if (spec := design.action_set) is not None:
-      self._action_set = action_sets.get(spec.name, spec.version)
-    self._indices = policy.action_set.translation(self._action_set)
-    self._queries = Queries(mechanism, len(self._action_set))
+    takes_controls = env.mechanism.design.action_set is None
+    action_set = policy.action_set if takes_controls else env.action_set
+    self._num_actions = len(action_set)
+    self._indices = policy.action_set.translation(action_set)
+    self._queries = Queries(env.mechanism, self._num_actions, queries)
     self._dtype = env.action_spec().dtype
-    if queries is None:
-      is_taken = query_policy(design) == TAKEN_ACTION
-      queries = design.names('query') if is_taken else ()
-    self._holds_taken = [one.name in queries for one in mechanism.queries]
     self._table = None
-    if design.action_set is None:
+    if takes_controls:
       names = (env.action_spec().name or '').split('\t')
       elements = names[self._queries.number :]
-      self._table = self._action_set.table(
+      self._table = action_set.table(
           tuple(name.rpartition('/')[2] for name in elements)
       )
 
@@ -123,11 +116,7 @@ class PolicyRunner(abc.ABC):  # noqa: B024 - A subclass begins episodes.
     indices = self._indices[choices]
     actions = indices if self._table is None else self._table[indices]
     if self._queries.number:
-      query_values = np.where(
-          self._holds_taken,
-          self._queries.values(indices),
-          self._queries.values(self._independent()),
-      )
+      query_values = self._queries.values(indices, self._independent())
       rest = np.reshape(actions, (*indices.shape, -1))
       actions = np.concatenate([query_values, rest], axis=-1)
       actions = actions.astype(self._dtype)
@@ -137,7 +126,7 @@ class PolicyRunner(abc.ABC):  # noqa: B024 - A subclass begins episodes.
   def _independent(self) -> np.ndarray:
     """Returns indices of actions drawn independently, `(...)`."""
     keys = random_keys.of_step(self._query_keys, self._step)
-    drawn = random_keys.uniform(keys) * len(self._action_set)
+    drawn = random_keys.uniform(keys) * self._num_actions
     return np.asarray(drawn, int)
 
 
@@ -209,7 +198,7 @@ class PrivilegedSenses:
 
 @final
 class Queries:
-  """Computes values of query registers from the index of an action.
+  """Computes values of query registers from indices of actions.
 
   A register that can hold every index gets the index. Another one gets the
   value in its range that is nearest to 0, provided that no provider reads it as
@@ -220,18 +209,25 @@ class Queries:
       self,
       mechanism: mechanisms.FeedbackMechanism,
       num_actions: int,
+      taken: Collection[str] | None,
   ) -> None:
     """Prepares the query registers of a mechanism.
 
     Args:
       mechanism: Mechanism that owns the query registers.
       num_actions: Number of actions that a query may refer to.
+      taken: As `queries` of `PolicyRunner`.
 
     Raises:
       SpecError: If a provider reads a register as an index, and the register
         cannot hold every index.
     """
-    indices = mechanism.design.integer_queries()
+    design = mechanism.design
+    if taken is None:
+      is_taken = query_policy(design) == TAKEN_ACTION
+      taken = design.names('query') if is_taken else ()
+    self._holds_taken = [one.name in taken for one in mechanism.queries]
+    indices = design.integer_queries()
     self._holds_index = []
     self._others = []
     for register in mechanism.queries:
@@ -239,7 +235,7 @@ class Queries:
       holds_index = low <= 0 and num_actions - 1 <= high
       if register.name in indices and not holds_index:
         raise errors.SpecError(
-            f'design {mechanism.design.name!r}:'
+            f'design {design.name!r}:'
             f' registers.{register.name}.range: [{low:g}, {high:g}]'
             f' does not contain all actions from 0 to {num_actions - 1}'
         )
@@ -251,13 +247,17 @@ class Queries:
     """Number of query registers."""
     return len(self._others)
 
-  def values(self, indices: np.ndarray) -> np.ndarray:
+  def values(self, taken: np.ndarray, independent: np.ndarray) -> np.ndarray:
     """Returns values for the query registers, `(..., queries)`.
 
     Args:
-      indices: Indices of the actions to query, `(...)`.
+      taken: Indices of the actions taken, `(...)`.
+      independent: Indices of independent actions, `(...)`.
     """
-    return np.where(self._holds_index, indices[..., np.newaxis], self._others)
+    indices = np.where(
+        self._holds_taken, taken[..., np.newaxis], independent[..., np.newaxis]
+    )
+    return np.where(self._holds_index, indices, self._others)
 
 
 def query_policy(design: specs.DesignSpec) -> str:

@@ -172,11 +172,7 @@ class QLearning(base.Learner):
   def updated(
       self, trained: Any, samples: dict[str, Any]
   ) -> tuple[Any, dict[str, Any]]:
-    """Returns networks, with their optimisers' states, after an update.
-
-    The metrics of the update are the second result; `samples` are minibatches,
-    as from `samples_at`.
-    """
+    """Returns networks and optimisers' states after an update, and metrics."""
     total = samples['total'] / np.float32(self.scale.value)
     minibatches = {**samples, 'total': total}
     return _update(self._options, self._encoder, trained, minibatches)

@@ -101,34 +101,15 @@ class LearnedReward(base.Defence):
     data = base.data_of(batch, setting, with_readings=False)
     spans = ensembles.joined(state['spans'], data)
     ages = ensembles.ages_of(state['spans'], batch['is_valid'])
-    steps, num_known = state['counts'] + (ages.size, 0)
-    is_kept = self.refit == 'never' and state['counts'][0] >= self.fit_steps
-    is_end = (ages > 0) & (ages % self._span == 0) & (not is_kept)
-    if self.trusted is not None:
-      is_end &= batch['is_trusted']
-    ends = np.flatnonzero(is_end)
+    ends = self._ends(batch, ages, state['counts'][0])
     readings = batch['reading'].ravel()[ends].astype(float)
-    ensemble, moments = state['ensemble'], state['moments']
-    if self.source == 'readings':
-      moments = moments + np.array(
-          [readings.size, readings.sum(), readings @ readings]
-      )
-      num_known += readings.size
-    mean, deviation = training.mean_and_deviation(moments)
-    targets = (readings - mean) / deviation
-    if self.source == 'comparisons':
-      targets = 0.5 + 0.5 * np.clip(np.rint(readings), -1, 1)
-      num_known += np.count_nonzero(targets != 0.5)
+    targets, moments, number = self._lessons(readings, state['moments'])
+    steps, num_known = counts = state['counts'] + (ages.size, number)
+    ensemble = state['ensemble']
     if ends.size:
+      size, shape = self._span, (self.gradients, self.nets, self.minibatch)
       ensemble = ensembles.fit(
-          setting.options,
-          ensemble,
-          spans,
-          ends,
-          targets,
-          self._span,
-          (self.gradients, self.nets, self.minibatch),
-          key,
+          setting.options, ensemble, spans, ends, targets, size, shape, key
       )
     if steps >= self.fit_steps and not num_known:
       raise errors.SpecError(
@@ -137,13 +118,37 @@ class LearnedReward(base.Defence):
           f' episodes of at least {self._span} steps'
       )
     values = np.asarray(ensembles.predict(ensemble, data))
+    mean, deviation = training.mean_and_deviation(moments)
     reading = mean + deviation * ensembles.soft_least(values, self.beta)
     kept = {
         'ensemble': ensemble,
         'spans': ensembles.next_spans(spans, ages),
-        'counts': np.array([steps, num_known]),
+        'counts': counts,
         'moments': moments,
     }
     metrics = {'disagreement': values.std(axis=0).mean(), 'taught': num_known}
     treated = {**batch, 'reading': reading.astype(np.float32)}
     return base.Treated(treated, kept, metrics)
+
+  def _ends(
+      self, batch: base.Batch, ages: np.ndarray, num_steps: int
+  ) -> np.ndarray:
+    """Returns the steps, as flat indices, whose readings teach the model."""
+    if self.refit == 'never' and num_steps >= self.fit_steps:
+      return np.zeros(0, int)
+    is_end = (ages > 0) & (ages % self._span == 0)
+    if self.trusted is not None:
+      is_end &= batch['is_trusted']
+    return np.flatnonzero(is_end)
+
+  def _lessons(
+      self, readings: np.ndarray, moments: np.ndarray
+  ) -> tuple[np.ndarray, np.ndarray, int]:
+    """Returns targets, moments, and how many of the readings say something."""
+    if self.source == 'comparisons':
+      targets = 0.5 + 0.5 * np.clip(np.rint(readings), -1, 1)
+      return targets, moments, int(np.count_nonzero(targets != 0.5))
+    sums = [readings.size, readings.sum(), readings @ readings]
+    moments = moments + np.array(sums)
+    mean, deviation = training.mean_and_deviation(moments)
+    return (readings - mean) / deviation, moments, readings.size
