@@ -138,11 +138,11 @@ def _film(
     why_no_film: Reason why films cannot be made, or `None`.
     shoot: Writes the film that it is given, and returns what that shows.
   """
-  # Imports dm_control.
-  from realab_suite.reports import demonstrations
+  # Imports numpy.
+  from realab_suite.lab.experiments import storage
 
   if why_no_film is None:
-    begun, film = folder / _BEGUN, folder / demonstrations.FILM
+    begun, film = folder / _BEGUN, folder / storage.FILM
     begun.unlink(missing_ok=True)
     try:
       shown = shoot(begun)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import contextlib
 import functools
 import pathlib
-from typing import Any, Final, NamedTuple, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
 import pandas as pd
@@ -28,9 +28,6 @@ from realab_suite.lab.verdicts import study
 from realab_suite.lab.verdicts import verdicts
 from realab_suite.policies import trained
 from realab_suite.reports import headline
-
-FILM: Final = 'film.mp4'
-"""Film in the folder of a demonstration."""
 
 _AGENT = 'agent: it can move its blocks'
 _TWIN = 'twin: nothing can move its blocks'

@@ -13,7 +13,6 @@ from realab_suite.lab.experiments import studies
 from realab_suite.lab.experiments import tables
 from realab_suite.lab.verdicts import study
 from realab_suite.reports import caveats
-from realab_suite.reports import demonstrations
 from realab_suite.reports import headline
 from realab_suite.reports import plots
 from realab_suite.reports import report_tables
@@ -161,7 +160,7 @@ def _films(
   for run in learned:
     for name in (
         f'{run.name}.mp4',
-        *([demonstrations.FILM] if len(learned) == 1 else []),
+        *([storage.FILM] if len(learned) == 1 else []),
     ):
       path = folder / name
       if path.is_file():
