@@ -299,7 +299,15 @@ def _unit(angle: np.ndarray) -> np.ndarray:
 
 
 def _expanded(values: np.ndarray, index: np.ndarray) -> np.ndarray:
-  """Returns an index with as many axes as `values`."""
+  """Returns an index as functions such as `take_along_axis` need it.
+
+  Args:
+    values: Array `(..., choices, *shape)`.
+    index: Index of a choice in each world, `(...)`.
+
+  Returns:
+    The index, of the shape `(..., 1, *ones)` with as many axes as `values`.
+  """
   missing = values.ndim - index.ndim
   return index.reshape((*index.shape, *(1,) * missing))
 
