@@ -299,14 +299,9 @@ def _unit(angle: np.ndarray) -> np.ndarray:
 
 
 def _expanded(values: np.ndarray, index: np.ndarray) -> np.ndarray:
-  """Returns an index as functions such as `take_along_axis` need it.
+  """Returns an index, `(...)`, with an axis of length 1 for each that it lacks.
 
-  Args:
-    values: Array `(..., choices, *shape)`.
-    index: Index of a choice in each world, `(...)`.
-
-  Returns:
-    The index, of the shape `(..., 1, *ones)` with as many axes as `values`.
+  `np.take_along_axis` needs as many axes as `values` has.
   """
   missing = values.ndim - index.ndim
   return index.reshape((*index.shape, *(1,) * missing))
