@@ -184,38 +184,42 @@ def validate(
   Raises:
     SpecError: If the data does not fit. The message lists the problems.
   """
-
-  def problems_of(changed: Mapping[str, Any]) -> list[str]:
-    try:
-      model_class.model_validate(changed)
-    except pydantic.ValidationError as error:
-      return _problems(error, changed)
-    return []
-
   data = loading.with_lists(data)
   changed = loading.apply_overrides(data, overrides) if overrides else data
   with contextlib.suppress(pydantic.ValidationError):
     return model_class.model_validate(changed)
-  before = problems = problems_of(data)
-  hint, changed = '', data
-  for override in overrides:
-    changed = loading.apply_overrides(changed, [override])
-    after = problems_of(changed)
-    if not set(after) <= set(problems):
-      if not before:  # Otherwise, the data is wrong without the override, too.
-        problems, where = after, loading.override_name(override)
-        hint = loading.hint_at_keys(override, data)
-      break
-    before = after
+  problems, override = _blamed(model_class, data, overrides)
+  where = loading.override_name(override) if override else where
+  hint = loading.hint_at_keys(override, data) if override else ''
   texts = problems[:_MAX_TOLD]
   if len(problems) > _MAX_TOLD:
     texts.append(f'and {len(problems) - _MAX_TOLD} more')
   raise messages.Location(where).error('; '.join(texts) + hint)
 
 
-def _problems(error: pydantic.ValidationError, data: Any) -> list[str]:
+def _blamed(
+    model_class: type[_Model], data: Any, overrides: Sequence[str]
+) -> tuple[list[str], str | None]:
+  """Returns problems, and the override that makes valid data have them."""
+  before = of_data = _problems(model_class, data)
+  changed = data
+  for override in overrides:
+    changed = loading.apply_overrides(changed, [override])
+    after = _problems(model_class, changed)
+    if not set(after) <= set(of_data):
+      # Otherwise, the data is wrong without the override, too.
+      return (of_data, None) if before else (after, override)
+    before = after
+  return of_data, None
+
+
+def _problems(model_class: type[_Model], data: Any) -> list[str]:
   """Returns the problems of data, each with its place and the given value."""
-  details = error.errors(include_url=False)
+  try:
+    model_class.model_validate(data)
+    return []
+  except pydantic.ValidationError as error:
+    details = error.errors(include_url=False)
   # Classes in unions of what a file can contain and what only Python can make.
   problems = [
       one for one in details if one['type'] not in _NOT_IN_FILES

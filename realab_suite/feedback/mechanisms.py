@@ -303,49 +303,54 @@ class FeedbackMechanism(modelled.ModelledEntity):
         for name, function in (privileged_senses or {}).items()
         if isinstance(function, meters.Instrument)
     }
-    for name, register in self._registers.items():
-      initial = self._design.registers[name].initial
-      if isinstance(initial, str):
-        # The same for all ports, or one for each.
-        of_ports = [f'{initial}_{port}' for port in register.PORTS]
-        if of_ports and initial not in functions:
-          names = of_ports
-        else:
-          names = [initial]
-        if any(name not in functions for name in names):
-          raise errors.SpecError(
-              f'design {self._design.name!r}: registers.{name}.initial: this'
-              f' world does not offer {initial!r}'
-              f'{messages.did_you_mean(initial, functions)}; must be'
-              f' numbers or one of {sorted(functions)}'
-          )
-        for function in names:
-          self._check_range(name, 'initial', function, ranges.get(function))
-        values = [functions[name] for name in names]
-        register.start_with(_stacked(values) if register.PORTS else values[0])
+    for name, spec in self._design.registers.items():
+      if isinstance(spec.initial, str):
+        self._connect_initial(name, spec.initial, functions, ranges)
     pairs: dict[str, tuple[str, measurements.Measure]] = {}
-    for i, spec in enumerate(self._design.meters):
-      asked = measurements.AskedRegisters(self._registers)
-      world = measurements.World(
-          messages.Location(
-              f'design {self._design.name!r}', ('meters', i, 'measures')
-          ),
-          functions,
-          parts,
-          asked,
-          ranges,
+    for i, meter_spec in enumerate(self._design.meters):
+      location = messages.Location(
+          f'design {self._design.name!r}', ('meters', i, 'measures')
       )
+      asked = measurements.AskedRegisters(self._registers)
       self._asked.append(asked)
-      title, measure, range_ = measurements.connect(spec.measures, world)
+      world = measurements.World(location, functions, parts, asked, ranges)
+      title, measure, range_ = measurements.connect(meter_spec.measures, world)
       asked.close()
-      written = self._design.register_of(spec.writes)
+      written = self._design.register_of(meter_spec.writes)
       self._check_range(written, f'meters.{i}', title, range_)
-      pairs[spec.writes] = f'meter:{title}', measure
+      pairs[meter_spec.writes] = f'meter:{title}', measure
     for target in self._targets([*pairs]):
       writers, measures = zip(*map(pairs.get, target.names), strict=True)
       meter = meters.Meter(_joint(measures), target.register, self._mjcf_root)
       self._phases.meters.append((writers, meter, target))
     self._is_connected = True
+
+  def _connect_initial(
+      self,
+      name: str,
+      initial: str,
+      functions: Mapping[str, measurements.Measure],
+      ranges: Mapping[str, measurements.Range],
+  ) -> None:
+    """Lets a register begin with `initial`, a name of a function.
+
+    With ports, it may be what the names of their functions begin with.
+    """
+    register = self._registers[name]
+    names = [f'{initial}_{port}' for port in register.PORTS]
+    if not names or initial in functions:
+      names = [initial]
+    if any(name not in functions for name in names):
+      raise errors.SpecError(
+          f'design {self._design.name!r}: registers.{name}.initial: this'
+          f' world does not offer {initial!r}'
+          f'{messages.did_you_mean(initial, functions)}; must be'
+          f' numbers or one of {sorted(functions)}'
+      )
+    for function in names:
+      self._check_range(name, 'initial', function, ranges.get(function))
+    values = [functions[name] for name in names]
+    register.start_with(_stacked(values) if register.PORTS else values[0])
 
   def _check_range(
       self,

@@ -97,11 +97,7 @@ class View:
     return self.classes == appearance.code(name)
 
   def through(self, hit: np.ndarray) -> 'View':
-    """Returns the view of an avatar that may walk through some things.
-
-    Args:
-      hit: True for the rays that hit them, `(..., rays)`.
-    """
+    """Returns the view for walking through what rays hit, `(..., rays)`."""
     berths = np.where(hit, _NO_OBSTACLE, _BERTH[self.classes])
     return dataclasses.replace(self, free=_free_way(self.distances, berths))
 

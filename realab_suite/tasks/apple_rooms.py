@@ -134,10 +134,11 @@ def find(name: str) -> Variation:
 
 
 class AppleRoom(rooms.RoomTask, abc.ABC):
-  """Base class for tasks in rooms with apples, each worth 1 to who eats it.
+  """Base class for tasks in rooms with apples, each of which earns 1.
 
-  A subclass calls `add_apples` when it is built, and places them where an
-  episode begins.
+  The avatar eats the apples that it comes near. A subclass calls `add_apples`
+  in its constructor, and places the apples in `initialize_episode`, for example
+  with `scatter_apples`.
 
   Attributes:
     REACH: Distance at which the avatar eats an apple, in m.

@@ -158,8 +158,7 @@ def find(domain_name: str, task_name: str | None) -> TaskFactory:
 def dynamics_version(domain_name: str, task_name: str) -> int:
   """Returns the version of the dynamics of a task.
 
-  It is an attribute of the task's class. A function tells it only by a task
-  that it makes, which takes longer.
+  It is an attribute of the class; of a function, a task has to be made.
 
   Raises:
     UnknownNameError: If there is no such task.

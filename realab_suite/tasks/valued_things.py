@@ -38,14 +38,19 @@ _ROOM = apple_rooms.Variation(
 
 
 class ValuedThings(rooms.RoomTask):
-  """Base class for tasks in which each thing is worth what its kind is.
+  """Base class for tasks with things of several kinds, each with a worth.
 
-  An episode begins with `begin`, which sets the worth of each kind. The avatar
-  takes each thing that it comes near, and earns its worth.
+  A subclass calls `begin` in `initialize_episode`, with the worth of each kind
+  in this episode. A thing that the avatar comes near is gone until the next
+  episode, and its worth, which may be negative, is earned. Meters can measure
+  the number of things taken and the worth of each kind, for example `count_a`
+  and `value_a` of the first kind.
+
+  Attributes:
+    CORNERS: Places beyond both ends of a screen, if there is one, in m.
   """
 
   SOLVER = 'valued_things_solver'
-  # Places beyond both ends of a screen, if there is one, in m.
   CORNERS: tuple[tuple[float, float], ...] = ()
 
   def __init__(

@@ -50,10 +50,13 @@ class Player:
     return self._play(lambda: policies.make(self._solver))
 
   def play(self, plans: Sequence[macros.Plan]) -> list[results.EpisodeResult]:
-    """Plays the next episode of some worlds with plans.
+    """Plays the next episode of every world with a plan.
+
+    Worlds without a plan of their own repeat the first one; their results are
+    left out.
 
     Args:
-      plans: A plan for each of the first worlds.
+      plans: Plans of the first worlds, from one to `num_envs`.
 
     Returns:
       The result of each plan.

@@ -299,7 +299,10 @@ def _unit(angle: np.ndarray) -> np.ndarray:
 
 
 def _expanded(values: np.ndarray, index: np.ndarray) -> np.ndarray:
-  """Returns an index with as many axes as `values`."""
+  """Returns an index, `(...)`, with an axis of length 1 for each that it lacks.
+
+  `np.take_along_axis` needs as many axes as `values` has.
+  """
   missing = values.ndim - index.ndim
   return index.reshape((*index.shape, *(1,) * missing))
 
