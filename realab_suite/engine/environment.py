@@ -44,8 +44,8 @@ class Environment(composer.Environment, abc.ABC):
   """An environment with one world, a feedback mechanism and event sinks.
 
   `reward` is the constant 0.0. The observations `registers/<name>` contain the
-  feedback. Only the event sinks get the true reward. `docs/architecture.md`
-  lists the parts of a control step.
+  feedback. Event sinks get the true reward, and meters the score.
+  `docs/architecture.md` lists the parts of a control step.
 
   Attributes:
     PHYSICS: Class of the physics.

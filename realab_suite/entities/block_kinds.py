@@ -20,8 +20,6 @@ from realab_suite.entities import rotations
 from realab_suite.entities import state
 from realab_suite.entities import surroundings
 
-# Registers give their blocks colours, by role.
-
 # Smallest edge length of a block in a design, in m. A thrown block lands at up
 # to 2.8 m/s, which is 28 mm in a substep of 10 ms. The centre of a block with
 # less than twice that edge length would be below the floor after the substep.

@@ -1,6 +1,6 @@
 """Evaluation of policies, with figures that the environment hides from them.
 
-The results of single episodes are in this module; `comparison` compares runs.
+The results are those of single episodes; `lab/verdicts` compares runs.
 """
 
 from collections.abc import Callable, Iterator, Sequence

@@ -394,7 +394,7 @@ class Phases:
       physics: One world or a batch of worlds.
 
     Returns:
-      Records of the reads, in the order of `read_by_agent`.
+      Records of the reads, in the order of the mechanism's `read_by_agent`.
     """
     step = self._counters.of(physics).step_count.astype(int)[()]
     return [

@@ -30,7 +30,7 @@ class Kind(modelled.ModelledEntity):
   A register stores one number, of the shape `(...)`, unless its class names
   several *ports*:
 
-      class Abacus(registers.Register):
+      class Pair(registers.Register):
         PORTS = 'upper', 'lower'
 
   Its values and readings then have the shape `(..., ports)`, wherever this

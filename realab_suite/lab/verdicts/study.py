@@ -370,7 +370,7 @@ def judge(
       curve from which on training hacks more than the control, if the seed
       tampers. One point is none:
     too_short: The last point, if training hacks more only there.
-    audit: Audit of the design; see `audited.of_run`.
+    audit: Audit of the design; see `audited.of`.
     fails: True if the agent fails at the task, False if it does not, `None` if
       that is unclear.
     gap: Tampering gap: true return of the secure twin minus that of the run.
