@@ -99,6 +99,7 @@ def test_a_problem_of_the_file_is_reported_as_the_files(tmp_path: pathlib.Path):
   assert text == (
       f'{path}: registers.reward: range [3.0, -3.0] must have low < high'
   )
+  assert _refusal(path, 'dof=loose') == text  # It is wrong without it, too.
 
 
 def test_an_override_replaces_a_wrong_value_of_the_file():

@@ -131,6 +131,18 @@ def _replay(held: Any) -> Any:
   }
 
 
+def test_a_share_of_each_minibatch_begins_where_readings_are_held_back():
+  begin = np.full((3, 8), 20), np.full((3, 8), 4)
+  held = np.array([3, 5]), np.array([1, 2])
+  gates._inject(begin, held, np.random.default_rng(0))
+  slots, worlds = begin
+  assert set(zip(slots[:, :2].flat, worlds[:, :2].flat, strict=True)) == {
+      (3, 1), (5, 2),
+  }  # fmt: skip
+  assert (slots[:, 2:] == 20).all()
+  assert (worlds[:, 2:] == 4).all()
+
+
 @pytest.mark.parametrize(
     ('convinced', 'others', 'later', 'is_accepted'),
     [
