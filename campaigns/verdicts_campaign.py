@@ -27,7 +27,7 @@ from scipy import optimize
 from scipy import stats
 
 from campaigns import figure_lines
-from realab_suite.lab.experiments import result_folders
+from realab_suite.lab.experiments import studies
 from realab_suite.lab.verdicts import hacking
 from realab_suite.lab.verdicts import seed_tests
 from realab_suite.lab.verdicts import verdicts
@@ -93,13 +93,13 @@ def families(folders: Sequence[pathlib.Path]) -> Iterator[Family]:
   """Yields the transplants of each twin once, even if runs share it."""
   shared = set()
   for folder in folders:
-    sweep = result_folders.load(folder)
-    for run in sweep.learned():
-      twin = sweep.twin(run)
-      if twin is None or run.stake is None or not twin.transplants:
+    sweep = studies.read_sweep(folder)
+    for run in sweep.agents():
+      transplant = sweep.runs.get(f'{run.name}.{hacking.TRANSPLANT}')
+      if transplant is None or run.stake is None:
         continue
-      control = hacking.control(run.name, twin.transplants, run.stake)
-      episodes = tuple((r.key, r.true_return) for r in twin.transplants)
+      control = hacking.control(run.name, transplant.rows, run.stake)
+      episodes = tuple((r.key, r.true_return) for r in transplant.rows)
       if control is None or episodes in shared:
         continue
       shared.add(episodes)

@@ -21,9 +21,9 @@ from realab_suite import errors
 from realab_suite.engine import environment
 from realab_suite.evaluation import results
 from realab_suite.lab.experiments import replays
-from realab_suite.lab.experiments import result_folders
-from realab_suite.lab.experiments import sweep_results
+from realab_suite.lab.experiments import studies
 from realab_suite.lab.experiments import tracking
+from realab_suite.lab.verdicts import study
 
 _PANEL = (420, 430)
 _GAP = 8
@@ -83,7 +83,7 @@ def draw(path: pathlib.Path, folder: pathlib.Path) -> None:
   Raises:
     ResultsError: If a run or an episode is missing.
   """
-  runs = result_folders.load(folder).runs
+  runs = studies.read_sweep(folder).without_controls
   typical = replays.typical_row(runs['reward']) if 'reward' in runs else None
   if typical is None:
     raise errors.ResultsError(
@@ -100,7 +100,7 @@ def draw(path: pathlib.Path, folder: pathlib.Path) -> None:
 
 def _replay(
     folder: pathlib.Path,
-    run: sweep_results.Run | None,
+    run: study.Run | None,
     like: results.EpisodeResult,
 ) -> list[_Moment]:
   """Returns the first moments of the episode in the same world as `like`."""

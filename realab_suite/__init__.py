@@ -19,6 +19,8 @@ from realab_suite import _versions
 
 if TYPE_CHECKING:
   from realab_suite.evaluation.evaluate import evaluate
+  from realab_suite.lab.experiments.studies import read as read_study
+  from realab_suite.lab.verdicts.study import judge
   from realab_suite.policies import make as make_policy
   from realab_suite.suite import embed
   from realab_suite.suite import load
@@ -29,9 +31,11 @@ __version__ = _versions.VERSION
 __all__ = [
     'embed',
     'evaluate',
+    'judge',
     'load',
     'load_batch',
     'make_policy',
+    'read_study',
 ]
 
 # Module and name of each function. Parts of the package need no world, so
@@ -39,9 +43,11 @@ __all__ = [
 _FUNCTIONS = {
     'embed': ('suite', 'embed'),
     'evaluate': ('evaluation.evaluate', 'evaluate'),
+    'judge': ('lab.verdicts.study', 'judge'),
     'load': ('suite', 'load'),
     'load_batch': ('suite', 'load_batch'),
     'make_policy': ('policies', 'make'),
+    'read_study': ('lab.experiments.studies', 'read'),
 }
 
 

@@ -4,7 +4,6 @@ import pathlib
 
 import numpy as np
 import pytest
-import yaml
 
 from realab_suite import suite
 from realab_suite.config import loading
@@ -31,17 +30,11 @@ def test_every_file_is_a_design_that_can_be_loaded_by_name():
 
 
 @_every_file
-def test_a_design_is_the_same_by_name_by_path_and_by_content(
-    path: pathlib.Path,
-):
+def test_a_design_has_the_name_of_its_file_and_is_described(path: pathlib.Path):
   design = specs.load(path)
   assert design.name == path.stem
   assert design.description.endswith('.')
-  text = path.read_text(encoding='utf-8')
-  assert text.startswith('# ')
-  for same in (path.stem, str(path), yaml.safe_load(text), design):
-    assert specs.load(same).digest() == design.digest()
-    assert specs.load(same) == design
+  assert path.read_text(encoding='utf-8').startswith('# ')
 
 
 def test_no_two_designs_are_the_same():

@@ -17,12 +17,12 @@ import sys
 
 import numpy as np
 
-from realab_suite.lab.experiments import result_folders
-from realab_suite.lab.experiments import sweep_results
+from realab_suite.lab.experiments import studies
 from realab_suite.lab.experiments import tables
 from realab_suite.lab.verdicts import comparison
 from realab_suite.lab.verdicts import intervals
 from realab_suite.lab.verdicts import stakes
+from realab_suite.lab.verdicts import study
 
 # Relative gain above which an episode is hacked, and own corruption in m above
 # which a register was moved.
@@ -39,7 +39,7 @@ _COLUMNS = {
 }
 
 
-def figures(run: sweep_results.Run, share: float) -> list[str]:
+def figures(run: study.Run, share: float) -> list[str]:
   """Returns the figures of a run: text with intervals.
 
   Args:
@@ -91,7 +91,7 @@ def main(folder: str, share: str = '0.25') -> None:
   path = pathlib.Path(folder)
   print('| ' + ' | '.join(['run', 'seeds', *_COLUMNS]) + ' |')
   print('|---|' + '---|' * (len(_COLUMNS) + 1))
-  for name, run in result_folders.load(path).runs.items():
+  for name, run in studies.read_sweep(path).without_controls.items():
     if run.rows:
       cells = figures(run, float(share))
       print(f'| `{name}` | {len(run.configs)} | ' + ' | '.join(cells) + ' |')

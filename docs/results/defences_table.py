@@ -36,17 +36,19 @@ from typing import Any, NamedTuple, final
 import matplotlib
 from matplotlib import figure
 import numpy as np
+import pandas as pd
 
 from realab_suite.config import validation
 from realab_suite.feedback.providers import inspection
 from realab_suite.lab.agents import defences
-from realab_suite.lab.experiments import result_folders
-from realab_suite.lab.experiments import sweep_results
+from realab_suite.lab.experiments import result_tables
+from realab_suite.lab.experiments import studies
 from realab_suite.lab.experiments import tables
 from realab_suite.lab.verdicts import counted
 from realab_suite.lab.verdicts import intervals
+from realab_suite.lab.verdicts import study
 from realab_suite.lab.verdicts import verdicts
-from realab_suite.reports import numbers
+from realab_suite.reports import headline
 from realab_suite.reports import plots
 
 _HEADER = (
@@ -55,6 +57,20 @@ _HEADER = (
     'false alarms (%)', 'training time', 'own gradient steps', 'inspections',
 )  # fmt: skip
 _WORLDS = ('run', 'lowest hack rate (%)', 'highest hack rate (%)')
+
+
+@final
+class Judged(NamedTuple):
+  """A run, its line and those of its seeds; see `study.judge`."""
+
+  run: study.Run
+  line: pd.Series
+  seeds: pd.DataFrame
+
+  @property
+  def columns(self) -> dict[str, tables.Figure]:
+    """Figures of the run in tables, by their columns."""
+    return result_tables.columns(self.line)
 
 
 @final
@@ -70,17 +86,17 @@ class Entry(NamedTuple):
   """
 
   world: str
-  own: numbers.Figures
-  twin: numbers.Figures | None
-  plain: numbers.Figures | None
-  plain_twin: numbers.Figures | None
+  own: Judged
+  twin: Judged | None
+  plain: Judged | None
+  plain_twin: Judged | None
 
 
-def _learner(run: sweep_results.Run) -> dict[str, Any]:
+def _learner(run: study.Run) -> dict[str, Any]:
   return dict(getattr(run.design.learner, 'model_extra', None) or {})
 
 
-def _defence(run: sweep_results.Run) -> defences.Defence | None:
+def _defence(run: study.Run) -> defences.Defence | None:
   """Returns the defence of a run, or `None` without a known one."""
   given = _learner(run).get('defence') or {}
   kind: Any = given.get('kind')
@@ -93,14 +109,14 @@ def _defence(run: sweep_results.Run) -> defences.Defence | None:
   return validation.validate(spec, fields, run.name)
 
 
-def _is_plain(run: sweep_results.Run) -> bool:
+def _is_plain(run: study.Run) -> bool:
   options = _learner(run)
   return 'reward' in options and not (
       options.get('defence') or options.get('gate')
   )
 
 
-def _common(one: sweep_results.Run, other: sweep_results.Run) -> int:
+def _common(one: study.Run, other: study.Run) -> int:
   """Returns the number of registers at the same place, 0 if others differ."""
   found, others = one.design.registers, other.design.registers
   names = found.keys() & others.keys()
@@ -114,19 +130,23 @@ def _common(one: sweep_results.Run, other: sweep_results.Run) -> int:
 
 def entries(folder: pathlib.Path) -> list[Entry]:
   """Returns an entry for each finished run of a learner in a sweep."""
-  sweep = result_folders.load(folder)
-  figures = numbers.compute(sweep)
-  runs = [run for run in sweep.learned() if run.name in figures]
+  sweep = studies.read_sweep(folder)
+  judged = study.judge(sweep)
+  figures = {
+      name: Judged(sweep.runs[name], line, study.seeds(judged, name))
+      for name, line in study.wholes(judged).items()
+  }
+  runs = [run for run in sweep.agents() if run.name in figures]
 
-  def twin(run: sweep_results.Run | None) -> numbers.Figures | None:
+  def twin(run: study.Run | None) -> Judged | None:
     found = run and sweep.twin(run)
     return figures.get(found.name) if found else None
 
-  def earned(run: sweep_results.Run) -> float:
+  def earned(run: study.Run) -> float:
     found = twin(run)
-    return found.summary.true_return.estimate if found else -np.inf
+    return found.line['true_return'].estimate if found else -np.inf
 
-  beside: dict[str, sweep_results.Run | None] = {}
+  beside: dict[str, study.Run | None] = {}
   for run in runs:
     kind = run.design.learner.kind
     same = [
@@ -159,8 +179,8 @@ def entries(folder: pathlib.Path) -> list[Entry]:
 def _tax(one: Entry) -> intervals.Interval | None:
   if one.twin is None or one.plain_twin is None:
     return None
-  most = one.plain_twin.summary.true_return.estimate
-  lost = numbers.gained(one.plain_twin.run, one.twin.run)
+  most = one.plain_twin.line['true_return'].estimate
+  lost = study.gained(one.plain_twin.run, one.twin.run)
   return lost.scaled(100.0 / most) if lost and most > 0 else None
 
 
@@ -201,7 +221,7 @@ def _false_alarms(one: Entry) -> float | None:
   return 100.0 * float(np.mean(shares)) if shares else None
 
 
-def _seconds(one: numbers.Figures) -> float | None:
+def _seconds(one: Judged) -> float | None:
   """Returns the mean time of training, in s."""
   sums = [
       sum(line['seconds'] for line in lines)
@@ -255,8 +275,8 @@ def _line(one: Entry) -> list[tables.Figure]:
       one.own.columns['true return'],
       one.own.columns['hack rate (%)'],
       one.own.columns["control's (%)"],
-      one.own.label,
-      one.own.summary.corruption,
+      headline.label_text(one.own.seeds['label']),
+      one.own.line['corruption'],
       _silenced(one),
       one.twin and one.twin.columns['true return'],
       _tax(one),
@@ -289,9 +309,9 @@ def worlds(found: Sequence[Entry]) -> list[list[tables.Figure]]:
   table: list[list[tables.Figure]] = [list(_WORLDS)]
   for of_design in rows.values():
     judged = [
-        (one.own.hacking.rate.estimate, one)
+        (one.own.line['hack_rate'].estimate, one)
         for one in of_design
-        if one.own.hacking is not None
+        if one.own.line['hack_rate'] is not None
     ]
     if len({one.world for _, one in judged}) > 1:
       judged.sort(key=lambda pair: pair[0])
@@ -314,11 +334,11 @@ def draw(found: Sequence[Entry]) -> figure.Figure:
   )
   for (world, there), (left, right) in zip(places.items(), panels, strict=True):
     for y, one in enumerate(there):
-      if one.own.hacking is not None:
-        _mark(left, y, one.own.hacking.rate.scaled(100.0), '#D55E00', 'o')
-      _mark(right, y - 0.12, one.own.summary.true_return, '#0072B2', 'o')
+      if (rate := one.own.line['hack_rate']) is not None:
+        _mark(left, y, rate.scaled(100.0), '#D55E00', 'o')
+      _mark(right, y - 0.12, one.own.line['true_return'], '#0072B2', 'o')
       if one.twin is not None:
-        _mark(right, y + 0.12, one.twin.summary.true_return, '#767676', 's')
+        _mark(right, y + 0.12, one.twin.line['true_return'], '#767676', 's')
     for axes, label in ((left, 'hack rate (%)'), (right, 'true return')):
       axes.set_xlabel(label)
       axes.set_ylim(len(there) - 0.5, -0.5)

@@ -100,11 +100,11 @@ def _train(folder: pathlib.Path) -> None:
   from realab_suite.engine import arguments
   from realab_suite.lab.experiments import engines
   from realab_suite.lab.experiments import experiment_specs
-  from realab_suite.lab.experiments import result_folders
   from realab_suite.lab.experiments import scheduler
+  from realab_suite.lab.experiments import studies
+  from realab_suite.lab.verdicts import study
   from realab_suite.reports import demonstrations
   from realab_suite.reports import html_page
-  from realab_suite.reports import numbers
 
   experiment = experiment_specs.load(EXPERIMENT)
   program.say(_beginning(experiment.training.steps, folder))
@@ -116,9 +116,9 @@ def _train(folder: pathlib.Path) -> None:
       program.say,
       accept_other_code=accepts,
   )
-  sweep = result_folders.load(folder, accepts)
+  sweep = studies.read_sweep(folder, accepts)
   _film(folder, why_no_film, functools.partial(demonstrations.film, sweep))
-  told = demonstrations.sentences(sweep, numbers.compute(sweep))
+  told = demonstrations.sentences(sweep, study.judge(sweep))
   _say_wrapped(f'\n{" ".join(told)}')
   page = html_page.write(folder, folder, lambda line: None, accepts)
   program.say(f'\nThe report, with learning curves, is {page}\n')
@@ -138,11 +138,11 @@ def _film(
     why_no_film: Reason why films cannot be made, or `None`.
     shoot: Writes the film that it is given, and returns what that shows.
   """
-  # Imports dm_control.
-  from realab_suite.reports import demonstrations
+  # Imports numpy.
+  from realab_suite.lab.experiments import storage
 
   if why_no_film is None:
-    begun, film = folder / _BEGUN, folder / demonstrations.FILM
+    begun, film = folder / _BEGUN, folder / storage.FILM
     begun.unlink(missing_ok=True)
     try:
       shown = shoot(begun)

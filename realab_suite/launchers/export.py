@@ -38,11 +38,11 @@ def main() -> None:
   # Imports dm_control, so a renderer has to be chosen first.
   from realab_suite.doors.data import export
   from realab_suite.doors.data import sources
-  from realab_suite.lab.experiments import result_folders
+  from realab_suite.lab.experiments import studies
 
   export.check(_FORMAT.value, output)
   run = flags.find_run(
-      result_folders.load(folder, flags.ACCEPT_OTHER_CODE.value).runs
+      studies.read_sweep(folder, flags.ACCEPT_OTHER_CODE.value).without_controls
   )
   export.export(
       sources.of_run(run, flags.num_episodes()),

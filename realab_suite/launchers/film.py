@@ -28,12 +28,12 @@ def main() -> None:
     raise errors.ResultsError(f'cannot make a film: {problem}')
   # Imports dm_control, so a renderer has to be chosen first.
   from realab_suite.lab.experiments import replays
-  from realab_suite.lab.experiments import result_folders
+  from realab_suite.lab.experiments import studies
   from realab_suite.reports import films
 
   flags.load_imports()
   run = flags.find_run(
-      result_folders.load(folder, flags.ACCEPT_OTHER_CODE.value).runs
+      studies.read_sweep(folder, flags.ACCEPT_OTHER_CODE.value).without_controls
   )
   row = replays.typical_row(run)
   if row is None:

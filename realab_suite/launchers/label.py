@@ -61,12 +61,14 @@ def main() -> None:
 def _of_sweep() -> list[Any]:
   """Returns the sources of the runs of a sweep, if there is one."""
   from realab_suite.doors.data import sources
-  from realab_suite.lab.experiments import result_folders
+  from realab_suite.lab.experiments import studies
 
   if not flags.INPUT.value:
     return []
   folder = pathlib.Path(flags.INPUT.value)
-  runs = result_folders.load(folder, flags.ACCEPT_OTHER_CODE.value).runs
+  runs = studies.read_sweep(
+      folder, flags.ACCEPT_OTHER_CODE.value
+  ).without_controls
   number = flags.num_episodes()
   return [sources.of_run(run, number) for run in runs.values()]
 

@@ -3,23 +3,30 @@
 from collections.abc import Iterable, Mapping
 import math
 
+import pandas as pd
+
 from realab_suite.lab.experiments import storage
-from realab_suite.lab.experiments import sweep_results
 from realab_suite.lab.verdicts import hacking
 from realab_suite.lab.verdicts import intervals
 from realab_suite.lab.verdicts import stakes
+from realab_suite.lab.verdicts import study
 from realab_suite.lab.verdicts import verdicts
-from realab_suite.reports import numbers
+from realab_suite.reports import episode_means
+
+_Lines = Mapping[str, pd.Series]
 
 
-def caveats(
-    sweep: sweep_results.Sweep, figures: Mapping[str, numbers.Figures]
-) -> list[str]:
+def caveats(sweep: study.Study, judged: pd.DataFrame) -> list[str]:
   """Returns the caveats of a sweep, one to three sentences each."""
+  lines = {
+      name: line
+      for name, line in study.wholes(judged).items()
+      if name in sweep.without_controls
+  }
   return [
-      *_on_completeness(sweep, figures),
-      *_on_seeds(figures),
-      *_on_data(figures),
+      *_on_completeness(sweep, lines),
+      *_on_seeds(lines),
+      *_on_data(sweep, lines),
       'Intervals are over training seeds, for one task and one setting of each'
       ' learner. They do not cover other tasks, longer training or other'
       ' settings.',
@@ -33,33 +40,32 @@ def caveats(
   ]
 
 
-def awaited(sweep: sweep_results.Sweep) -> list[sweep_results.Job]:
-  """Returns unfinished jobs; of published results, only of published runs."""
+def awaited(sweep: study.Study) -> list[tuple[str, int]]:
+  """Returns unfinished runs and seeds; if published, of published runs."""
   return [
-      job
-      for job in sweep.unfinished
-      if sweep.has_traces or sweep.runs[job.run].is_done
+      (run, seed)
+      for run, seed in sweep.unfinished
+      if sweep.has_traces or sweep.runs[run].is_done
   ]
 
 
-def _on_completeness(
-    sweep: sweep_results.Sweep, figures: Mapping[str, numbers.Figures]
-) -> Iterable[str]:
+def _on_completeness(sweep: study.Study, lines: _Lines) -> Iterable[str]:
   if sweep.is_calibration:
     yield (
         'These are calibration seeds, which were used to choose settings. Do'
         ' not report them as results.'
     )
-  if len(sweep.codes) > 1:
-    yield f'Different code made the results: {", ".join(sorted(sweep.codes))}.'
+  if len(codes := sweep.codes(storage.CODE)) > 1:
+    yield f'Different code made the results: {", ".join(sorted(codes))}.'
   if not sweep.has_imprints:
     yield f'These are {storage.NO_IMPRINTS}.'
-  done = [name for name, run in sweep.runs.items() if run.is_done]
+  runs = sweep.without_controls
+  done = [name for name, run in runs.items() if run.is_done]
   if not sweep.has_traces and (
       absent := [
           name
-          for name, run in sweep.runs.items()
-          if name not in done and sweep.family(run) in (name, *done)
+          for name, run in runs.items()
+          if name not in done and run.family in (name, *done)
       ]
   ):
     yield (
@@ -68,23 +74,23 @@ def _on_completeness(
     )
   if unfinished := awaited(sweep):
     seeds_of_run: dict[str, list[str]] = {}
-    for job in unfinished:
-      seeds_of_run.setdefault(job.run, []).append(str(job.seed))
+    for run_name, seed in unfinished:
+      seeds_of_run.setdefault(run_name, []).append(str(seed))
     missing = ', '.join(
         f'{name} (seed{"s" if len(seeds) > 1 else ""} {", ".join(seeds)})'
         for name, seeds in seeds_of_run.items()
     )
     yield (f'Jobs without results: {missing}. Comparisons exclude their seeds.')
-  for name, run in sweep.runs.items():
-    if run.is_done and name not in figures:
+  for name, run in runs.items():
+    if run.is_done and name not in lines:
       yield (
           f'There are no figures for {name}: all of its {len(run.rows)}'
           ' episodes failed or were given up.'
       )
 
 
-def _on_seeds(figures: Mapping[str, numbers.Figures]) -> Iterable[str]:
-  counts = [one.summary.num_seeds for one in figures.values()]
+def _on_seeds(lines: _Lines) -> Iterable[str]:
+  counts = [line['num_seeds'] for line in lines.values()]
   if 1 in counts:
     yield (
         'With one seed, intervals are over its episodes and do not cover other'
@@ -101,9 +107,9 @@ def _on_seeds(figures: Mapping[str, numbers.Figures]) -> Iterable[str]:
     )
 
 
-def _on_data(figures: Mapping[str, numbers.Figures]) -> Iterable[str]:
+def _on_data(sweep: study.Study, lines: _Lines) -> Iterable[str]:
   given_up = _listed(
-      {name: one.summary.num_given_up for name, one in figures.items()}
+      {name: line['num_given_up'] for name, line in lines.items()}
   )
   if given_up:
     yield (
@@ -111,22 +117,23 @@ def _on_data(figures: Mapping[str, numbers.Figures]) -> Iterable[str]:
         ' with their figures up to that point, so true returns are lower'
         ' bounds; others do not count. No favourable label is given.'
     )
-  failed = _listed(
-      {name: one.summary.num_failed for name, one in figures.items()}
-  )
+  failed = _listed({name: line['num_failed'] for name, line in lines.items()})
   if failed:
     yield (
         'Episodes that failed, for example because the physics diverged:'
         f' {failed}. They do not count. No favourable label is given, because'
         ' the agent may have caused the failure.'
     )
-  for name, one in figures.items():
-    if one.run.twin_of and (saturated := stakes.saturation(one.run.rows)):
+  for name in lines:
+    run = sweep.runs[name]
+    is_twin = run.role is study.Role.TWIN
+    if is_twin and (saturated := stakes.saturation(run.rows)):
       yield f'In {name}, {saturated}.'
   uncovered = [
-      f'{name} ({1 - one.coverage:.1%})'
-      for name, one in figures.items()
-      if one.coverage is not None and one.coverage < 0.99
+      f'{name} ({1 - coverage:.1%})'
+      for name in lines
+      if (coverage := episode_means.coverage(sweep.runs[name])) is not None
+      and coverage < 0.99
   ]
   if uncovered:
     yield (

@@ -4,13 +4,14 @@ A demonstration is a sweep of one learned run and its secure twin, or episodes
 of the trained agents that ship.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 import contextlib
 import functools
 import pathlib
-from typing import Any, Final, NamedTuple, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
+import pandas as pd
 
 from realab_suite import errors
 from realab_suite import policies
@@ -21,16 +22,12 @@ from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import results
 from realab_suite.feedback import specs
 from realab_suite.lab.experiments import replays
-from realab_suite.lab.experiments import sweep_results
 from realab_suite.lab.experiments import tracking
 from realab_suite.lab.verdicts import counted
+from realab_suite.lab.verdicts import study
 from realab_suite.lab.verdicts import verdicts
 from realab_suite.policies import trained
 from realab_suite.reports import headline
-from realab_suite.reports import numbers
-
-FILM: Final = 'film.mp4'
-"""Film in the folder of a demonstration."""
 
 _AGENT = 'agent: it can move its blocks'
 _TWIN = 'twin: nothing can move its blocks'
@@ -44,7 +41,7 @@ _Rows = Sequence[results.EpisodeResult]
 _PlayAgain = Callable[[results.EpisodeResult, replays.OnStep], Any]
 
 
-def film(sweep: sweep_results.Sweep, path: pathlib.Path) -> str:
+def film(sweep: study.Study, path: pathlib.Path) -> str:
   """Films the twin beside the agent, in the episode of the largest gain.
 
   Args:
@@ -62,23 +59,20 @@ def film(sweep: sweep_results.Sweep, path: pathlib.Path) -> str:
   return _film(path, (run.rows, twin.rows), plays)
 
 
-def sentences(
-    sweep: sweep_results.Sweep, figures: Mapping[str, numbers.Figures]
-) -> list[str]:
+def sentences(sweep: study.Study, judged: pd.DataFrame) -> list[str]:
   """Returns the behaviour of the agent, in counts.
 
   Args:
     sweep: The demonstration.
-    figures: Figures of its runs.
+    judged: What `study.judge` returns.
   """
   run, twin = _pair(sweep)
-  learned, secure = figures.get(run.name), figures.get(twin.name)
-  did = headline.counts(sweep, learned) if learned else None
-  if learned is None or secure is None or did is None:
+  wholes = study.wholes(judged)
+  line, secure = wholes.get(run.name), wholes.get(twin.name)
+  did = None if line is None else headline.counts(sweep, run, line)
+  if line is None or secure is None or did is None:
     return ['These results do not say whether the agent tampers.']
-  earned, reached = (
-      one.summary.true_return.estimate for one in (learned, secure)
-  )
+  earned, reached = (one['true_return'].estimate for one in (line, secure))
   return [
       did,
       _earned(earned, reached),
@@ -229,10 +223,10 @@ def _world_of(name: str) -> tuple[worlds.World, specs.DesignSpec]:
 
 
 def _pair(
-    sweep: sweep_results.Sweep,
-) -> tuple[sweep_results.Run, sweep_results.Run]:
+    sweep: study.Study,
+) -> tuple[study.Run, study.Run]:
   """Returns the learned run and its twin."""
-  [run] = sweep.learned()
+  [run] = sweep.agents()
   twin = sweep.twin(run)
   if twin is None:
     raise errors.ResultsError(f'{sweep.folder}: {run.name} has no secure twin')

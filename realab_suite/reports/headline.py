@@ -1,21 +1,20 @@
 """First lines of a report: what each learned agent does, and how sure it is."""
 
 import collections
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
+import pandas as pd
 
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import results
 from realab_suite.feedback import objectives
 from realab_suite.feedback import specs
-from realab_suite.lab.experiments import sweep_results
 from realab_suite.lab.experiments import tables
 from realab_suite.lab.verdicts import counted
-from realab_suite.lab.verdicts import hacking
 from realab_suite.lab.verdicts import intervals
+from realab_suite.lab.verdicts import study
 from realab_suite.lab.verdicts import verdicts
-from realab_suite.reports import numbers
 
 _Label = verdicts.Label
 _Rows = Sequence[results.EpisodeResult]
@@ -30,9 +29,7 @@ _BLOCKS = {
 }
 
 
-def headline(
-    sweep: sweep_results.Sweep, figures: Mapping[str, numbers.Figures]
-) -> dict[str, list[str]]:
+def headline(sweep: study.Study, judged: pd.DataFrame) -> dict[str, list[str]]:
   """Returns the first lines on each learned run, those that tamper first.
 
   The lines are, in this order: whether the run fails at the task, beside its
@@ -41,23 +38,24 @@ def headline(
 
   Args:
     sweep: The sweep.
-    figures: Figures of its runs.
+    judged: What `study.judge` returns.
   """
-  runs = [run for run in sweep.learned() if run.name in figures]
+  wholes = study.wholes(judged)
+  runs = [run for run in sweep.agents() if run.name in wholes]
   # Sorting keeps the order of the experiment otherwise.
-  runs.sort(key=lambda run: -_share(figures[run.name]))
-  return {run.name: _lines(sweep, figures, figures[run.name]) for run in runs}
+  runs.sort(key=lambda run: -_share(study.seeds(judged, run.name)))
+  return {run.name: _lines(sweep, wholes, judged, run) for run in runs}
 
 
-def counts(sweep: sweep_results.Sweep, learned: numbers.Figures) -> str | None:
+def counts(sweep: study.Study, run: study.Run, line: pd.Series) -> str | None:
   """Returns what a learned run did, in counts; `None` without a hack rate."""
-  run = learned.run
-  if learned.hacking is None or run.stake is None:
+  if line['hack_rate'] is None or run.stake is None:
     return None
-  limit = learned.hacking.control.limit
-  rows = counted.of(run.rows, run.stake, limit)
-  hacked = [row for row in rows if counted.is_hacked(row, run.stake, limit)]
-  return did(run.design, rows, hacked, numbers.solver_rows(sweep, run))
+  rows = counted.of(run.rows, run.stake, line['limit'])
+  hacked = [
+      row for row in rows if counted.is_hacked(row, run.stake, line['limit'])
+  ]
+  return did(run.design, rows, hacked, sweep.solver(run))
 
 
 def did(
@@ -120,92 +118,109 @@ def moved(design: specs.DesignSpec, rows: _Rows) -> dict[str, float]:
   return dict(sorted(sizes.items(), key=lambda item: -item[1]))
 
 
-def chip(learned: numbers.Figures) -> tuple[str, str]:
-  """Returns the label of a run in a word, and the seeds that it stands for."""
-  labels = [seed.judgement.label for seed in learned.seeds.values()]
-  seeds = intervals.counted(len(labels), 'seed')
-  if learned.verdict is None or len(labels) < verdicts.FEWEST_SEEDS:
-    [(label, count)] = collections.Counter(labels).most_common(1)
-    return label.value, f'{count} of {seeds}, no verdict'
-  label, count = learned.verdict.label, learned.verdict.num_tampering
-  return label.value, f'{count} of {seeds}' if count else seeds
+def chip(line: pd.Series, seeds: pd.DataFrame) -> tuple[str, str]:
+  """Returns the label of a run in a word, and the seeds that it stands for.
+
+  Args:
+    line: Line of the run; see `study.judge`.
+    seeds: Lines of its seeds.
+  """
+  number_of = intervals.counted(len(seeds), 'seed')
+  if len(seeds) < verdicts.FEWEST_SEEDS:
+    [(label, count)] = collections.Counter(seeds['label']).most_common(1)
+    return label.value, f'{count} of {number_of}, no verdict'
+  count = line['num_tampering']
+  return line['label'].value, f'{count} of {number_of}' if count else number_of
 
 
-def _share(learned: numbers.Figures) -> float:
-  labels = [seed.judgement.label for seed in learned.seeds.values()]
-  return sum(label is _Label.TAMPERS for label in labels) / len(labels)
+def label_text(labels: Iterable[verdicts.Label]) -> str:
+  """Returns labels with the numbers of their seeds, most frequent first."""
+  labels = list(labels)
+  number = len(labels)
+  label_counts = collections.Counter(label.value for label in labels)
+  if len(label_counts) == 1:
+    [label] = label_counts
+    return f'{label} (all {number} seeds)' if number > 1 else label
+  return ', '.join(
+      f'{label} ({count} of {number})'
+      for label, count in label_counts.most_common()
+  )
+
+
+def _share(seeds: pd.DataFrame) -> float:
+  labels = list(seeds['label'])
+  return labels.count(_Label.TAMPERS) / len(labels)
 
 
 def _lines(
-    sweep: sweep_results.Sweep,
-    figures: Mapping[str, numbers.Figures],
-    learned: numbers.Figures,
+    sweep: study.Study,
+    wholes: Mapping[str, pd.Series],
+    judged: pd.DataFrame,
+    run: study.Run,
 ) -> list[str]:
-  lines = [_task(sweep, figures, learned), _labels(learned)]
-  if learned.hacking is not None:
-    lines.append(_rate(learned.hacking))
-  if shares := {x.misnamed for x in learned.seeds.values() if x.misnamed}:
+  line, seeds = wholes[run.name], study.seeds(judged, run.name)
+  twin = sweep.twin(run)
+  lines = [
+      _task(line, wholes.get(twin.name) if twin else None),
+      _labels(line, seeds),
+  ]
+  if line['hack_rate'] is not None:
+    lines.append(_rate(line))
+  if shares := {share for share in seeds['misnamed'] if share}:
     lines.append(
         f'Steps whose query is not its action: {", ".join(sorted(shares))}.'
     )
-  lines.append(f'Audit: {_audit(learned.audit)}.')
-  training = learned.training
-  if training is not None:
+  lines.append(f'Audit: {_audit(line["audit"])}.')
+  if line['num_training'] is not None:
     lines.append(
-        f'Tampering paid in {training.paid:,} of'
-        f' {intervals.counted(training.episodes, "training episode")}.'
+        f'Tampering paid in {line["paid"]:,} of'
+        f' {intervals.counted(line["num_training"], "training episode")}.'
     )
   return lines
 
 
-def _task(
-    sweep: sweep_results.Sweep,
-    figures: Mapping[str, numbers.Figures],
-    learned: numbers.Figures,
-) -> str:
+def _task(line: pd.Series, secure: pd.Series | None) -> str:
   """Returns whether an agent fails at the task, beside its secure twin."""
   answer = {
       True: 'Fails at the task',
       False: 'Does the task',
       None: 'May fail at the task',
-  }[learned.fails]
-  twin = sweep.twin(learned.run)
-  secure = None if twin is None else figures.get(twin.name)
+  }[line['fails']]
   beside = ''
   if secure is not None:
-    beside = f', its secure twin {number(secure.summary.true_return.estimate)}'
-    if learned.fails and secure.fails:
+    reached = number(secure['true_return'].estimate)
+    beside = f', its secure twin {reached}'
+    if line['fails'] and secure['fails']:
       beside += ', which fails as well'
-  observed = number(learned.summary.observed_return.estimate)
-  earned = _return(learned)
+  observed = number(line['observed_return'].estimate)
+  earned = _return(line)
   return f'{answer}: it earns {earned}{beside}. It observes {observed}.'
 
 
-def _labels(learned: numbers.Figures) -> str:
+def _labels(line: pd.Series, judged_seeds: pd.DataFrame) -> str:
   """Returns the label, in how many seeds, and the verdict if there is one."""
-  judgements = [seed.judgement for seed in learned.seeds.values()]
-  number_of = len(judgements)
+  labels = list(judged_seeds['label'])
+  number_of = len(labels)
   for label in (_Label.TAMPERS, _Label.DOES_NOT_TAMPER):
-    count = sum(judgement.label is label for judgement in judgements)
-    if count:
+    if count := labels.count(label):
       seeds = intervals.counted(number_of, 'seed')
       text = f'{_capital(label.value)} in {count} of {seeds}'
       break
   else:
-    text = _capital(str(judgements[0]))
+    text = _capital(judged_seeds['verdict'].iloc[0])
     if number_of > 1:
       first, _, reason = text.partition(':')
       text = f'{first} in all {number_of} seeds:{reason}'
-  if judgements[0].label in (_Label.COINCIDES, _Label.NOT_JUDGED):
+  if labels[0] in (_Label.COINCIDES, _Label.NOT_JUDGED):
     return f'{text}.'
-  if learned.verdict is None or number_of < verdicts.FEWEST_SEEDS:
+  if number_of < verdicts.FEWEST_SEEDS:
     return f'{text}; {verdicts.needed_seeds(number_of)}.'
-  words = learned.verdict.words
+  words = line['verdict']
   if words == text[:1].lower() + text[1:]:
     return f'Verdict: {words}.'
   _, _, reason = text.partition(': ')
   if reason and words.endswith(reason):
-    words = learned.verdict.label.value
+    words = line['label'].value
   return f'{text}. Verdict: {words}.'
 
 
@@ -213,21 +228,22 @@ def _capital(text: str) -> str:
   return text[:1].upper() + text[1:]
 
 
-def _rate(figures: hacking.Hacking) -> str:
+def _rate(line: pd.Series) -> str:
   # The unit stands before the interval: '80 % [0, 100]'.
-  rate, *interval = tables.text(figures.rate.scaled(100)).split(maxsplit=1)
-  control_rate = tables.text(100 * figures.control.count.rate)
+  in_percent = tables.text(line['hack_rate'].scaled(100))
+  rate, *interval = in_percent.split(maxsplit=1)
+  control_rate = tables.text(100 * line['control_rate'])
   text = ' '.join([f'Hack rate {rate} %', *interval])
-  text += f', beside {control_rate} % of {figures.control.name}'
-  if (limit := figures.control.limit) != counted.SHARE_OF_STAKE:
+  text += f', beside {control_rate} % of {line["control"]}'
+  if (limit := line['limit']) != counted.SHARE_OF_STAKE:
     text += (
         f'; hacked is a gain above {tables.text(limit)} stakes, not'
         f' {counted.SHARE_OF_STAKE:g}, which the control often exceeds'
     )
-  if figures.count.ended:
+  if line['ended']:
     text += (
-        f'; only a corrupted signal ended {figures.count.ended} of'
-        f' {figures.count.episodes} episodes'
+        f'; only a corrupted signal ended {line["ended"]} of'
+        f' {line["num_judged"]} episodes'
     )
   return f'{text}.'
 
@@ -241,12 +257,12 @@ def _audit(audit: verdicts.Audit | None) -> str:
   return f'resisted {audit.num_episodes:,} episodes{small}'
 
 
-def _return(learned: numbers.Figures) -> str:
+def _return(line: pd.Series) -> str:
   """Returns the true return of a run, with the largest possible one."""
-  interval: intervals.Interval = learned.summary.true_return
+  interval: intervals.Interval = line['true_return']
   largest = interval.bounds[1]
   of = '' if largest is None else f' of {largest:g}'
-  least = 'at least ' if learned.summary.num_cut else ''
+  least = 'at least ' if line['num_cut'] else ''
   return f'{least}{number(interval.estimate)}{of}'
 
 

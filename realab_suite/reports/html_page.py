@@ -5,16 +5,15 @@ import pathlib
 import shutil
 
 import jinja2
+import pandas as pd
 import yaml
 
-from realab_suite.lab.experiments import result_folders
 from realab_suite.lab.experiments import storage
-from realab_suite.lab.experiments import sweep_results
+from realab_suite.lab.experiments import studies
 from realab_suite.lab.experiments import tables
+from realab_suite.lab.verdicts import study
 from realab_suite.reports import caveats
-from realab_suite.reports import demonstrations
 from realab_suite.reports import headline
-from realab_suite.reports import numbers
 from realab_suite.reports import plots
 from realab_suite.reports import report_tables
 from realab_suite.reports import words
@@ -24,8 +23,8 @@ CSV = 'tables.csv'
 MARKDOWN = 'tables.md'
 SEEDS_CSV = 'seeds.csv'
 
-View = Callable[[sweep_results.Sweep, Mapping[str, numbers.Figures]], str]
-"""Returns the figures of a sweep in another format."""
+View = Callable[[study.Study, pd.DataFrame], str]
+"""Returns a judged study in another format."""
 
 
 def write(
@@ -51,41 +50,52 @@ def write(
     ResultsError: If the folder does not contain a sweep, a file in it is
       damaged, a design or world is unknown, or the output cannot be written.
   """
-  sweep = result_folders.load(folder, accept_other_code)
-  figures = numbers.compute(sweep, say)
-  lines = headline.headline(sweep, figures)
-  page_tables = report_tables.page_tables(sweep, figures, lines)
-  cautions = caveats.caveats(sweep, figures)
+  sweep = studies.read_sweep(folder, accept_other_code)
+  judged = study.judge(sweep, say)
+  wholes, runs = study.wholes(judged), sweep.without_controls
+  lines = headline.headline(sweep, judged)
+  page_tables = report_tables.page_tables(sweep, judged, lines)
+  cautions = caveats.caveats(sweep, judged)
   title = f'Tampering report: {sweep.experiment.get("name", folder.name)}'
-  colours = plots.colours([run.name for run in sweep.learned()])
+  colours = plots.colours([run.name for run in sweep.agents()])
   with storage.explained(output):
     output.mkdir(parents=True, exist_ok=True)
-  curves = plots.learning(sweep, figures, colours)
+  curves = plots.learning(sweep, judged, colours)
   page = _template().render(
       title=title,
       description=sweep.experiment.get('description', ''),
       facts=_facts(sweep),
       headline=lines,
-      counts={name: headline.counts(sweep, figures[name]) for name in lines},
-      chips={name: headline.chip(figures[name]) for name in lines},
-      films=_films(sweep, output),
-      rates={
-          name: (hacked, plots.rates(hacked, colours[name]))
+      counts={
+          name: headline.counts(sweep, runs[name], wholes[name])
           for name in lines
-          if (hacked := figures[name].hacking)
+      },
+      chips={
+          name: headline.chip(wholes[name], study.seeds(judged, name))
+          for name in lines
+      },
+      films=_films(folder, sweep, output),
+      rates={
+          name: (wholes[name], plots.rates(judged, name, colours[name]))
+          for name in lines
+          if wholes[name]['hack_rate'] is not None
       },
       curves=curves,
       order=[name for name in {**lines, **curves} if name in curves],
-      runs=sweep.runs,
+      runs=runs,
       baselines={
           name: run.baseline
-          for name, run in sweep.runs.items()
-          if run.baseline in figures
+          for name, run in runs.items()
+          if run.baseline in wholes
       },
-      twins={run.twin_of for run in sweep.runs.values() if run.is_done},
+      twins={
+          run.family
+          for run in runs.values()
+          if run.role is study.Role.TWIN and run.is_done
+      },
       adapted=[
           run.name
-          for run in sweep.learned()
+          for run in sweep.agents()
           if run.is_done and plots.has_adaptation(run)
       ],
       tables=page_tables,
@@ -95,13 +105,13 @@ def write(
       experiment=yaml.safe_dump(dict(sweep.experiment), sort_keys=False),
       designs={
           name: yaml.safe_dump(dict(run.config), sort_keys=False)
-          for name, run in sweep.runs.items()
+          for name, run in runs.items()
           if run.is_done
       },
       colours={
-          name: colours[sweep.family(run)]
-          for name, run in sweep.runs.items()
-          if sweep.family(run) in colours
+          name: colours[run.family]
+          for name, run in runs.items()
+          if run.family in colours
       },
   )
   said = [f'{run}: {" ".join(one)}' for run, one in lines.items()]
@@ -115,10 +125,10 @@ def write(
   ]
   for name, content in (
       (MARKDOWN, '\n\n'.join(markdown) + '\n'),
-      (CSV, report_tables.csv_text(figures)),
-      (SEEDS_CSV, report_tables.seeds_csv_text(figures)),
+      (CSV, report_tables.csv_text(sweep, judged)),
+      (SEEDS_CSV, report_tables.seeds_csv_text(sweep, judged)),
       (PAGE, page),
-      *((name, view(sweep, figures)) for name, view in (more or {}).items()),
+      *((name, view(sweep, judged)) for name, view in (more or {}).items()),
   ):
     storage.write_whole(output / name, content.encode())
   for line in said:
@@ -141,40 +151,42 @@ def _template() -> jinja2.Template:
   return environment.get_template('report.html.j2')
 
 
-def _films(sweep: sweep_results.Sweep, output: pathlib.Path) -> dict[str, str]:
+def _films(
+    folder: pathlib.Path, sweep: study.Study, output: pathlib.Path
+) -> dict[str, str]:
   """Returns the film of each run that has one, and copies it to the page."""
-  learned = sweep.learned()
+  learned = sweep.agents()
   films = {}
   for run in learned:
     for name in (
         f'{run.name}.mp4',
-        *([demonstrations.FILM] if len(learned) == 1 else []),
+        *([storage.FILM] if len(learned) == 1 else []),
     ):
-      path = sweep.folder / name
+      path = folder / name
       if path.is_file():
         films[run.name] = name
-        if not output.samefile(sweep.folder):
+        if not output.samefile(folder):
           shutil.copyfile(path, output / name)
   return films
 
 
-def _facts(sweep: sweep_results.Sweep) -> str:
+def _facts(sweep: study.Study) -> str:
   """Returns the line on the experiment at the top of the page."""
   experiment, awaited = sweep.experiment, caveats.awaited(sweep)
   settings = experiment['runs']
-  ran = {job.run for job in awaited}
-  runs = [run for run in sweep.learned() if run.is_done or run.name in ran]
+  ran = {run for run, _ in awaited}
+  runs = [run for run in sweep.agents() if run.is_done or run.name in ran]
   tasks = [settings[run.name].get('task') or experiment['task'] for run in runs]
   steps = [
       settings[run.name].get('steps') or experiment['training']['steps']
       for run in runs
   ]
-  seeds = sorted({job.seed for run in runs for job in run.jobs})
+  seeds = sorted({seed for run in runs for seed in run.planned})
   shown = ', '.join(map(str, seeds))
   if len(seeds) == seeds[-1] - seeds[0] + 1 > 2:
     shown = f'{seeds[0]} to {seeds[-1]}'
   ends = dict.fromkeys([f'{min(steps):,}', f'{max(steps):,}'])
-  done = sum(len(run.configs) for run in sweep.runs.values())
+  done = sum(len(run.configs) for run in sweep.without_controls.values())
   return (
       f'{", ".join(dict.fromkeys(tasks))}; {"seeds" if seeds[1:] else "seed"}'
       f' {shown}; {" to ".join(ends)} control steps of training,'

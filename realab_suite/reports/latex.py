@@ -4,16 +4,18 @@ from collections.abc import Iterable, Mapping
 import re
 from typing import Any, Final
 
-from realab_suite.lab.experiments import sweep_results
+import pandas as pd
+
+from realab_suite.lab.experiments import result_tables
 from realab_suite.lab.experiments import tables
 from realab_suite.lab.verdicts import counted
+from realab_suite.lab.verdicts import study
 from realab_suite.lab.verdicts import verdicts
 from realab_suite.reports import caveats
-from realab_suite.reports import numbers
+from realab_suite.reports import headline
 
 FILE: Final = 'report.tex'
 
-_Figures = Mapping[str, numbers.Figures]
 # In hundredths of the width of a line.
 _COLUMNS = {
     'run': 16, 'true return': 18, "its twin's": 18, 'hack rate (%)': 18,
@@ -70,16 +72,18 @@ _TABLE = r"""
 """
 
 
-def text(sweep: sweep_results.Sweep, figures: _Figures) -> str:
+def text(sweep: study.Study, judged: pd.DataFrame) -> str:
   """Returns methods, a table, caveats and versions of a sweep as LaTeX."""
-  learned = [figures[x.name] for x in sweep.learned() if x.name in figures]
+  wholes = study.wholes(judged)
+  learned = {x.name: x for x in sweep.agents() if x.name in wholes}
   reasons = (
-      f'{one.run.name}: {one.verdict.words}.'
-      for one in learned
-      if one.verdict and one.verdict.reason
+      f'{name}: {wholes[name]["verdict"]}.'
+      for name in learned
+      if wholes[name]['reason']
   )
-  lines = [_line(_cells(sweep, figures, one)) for one in learned]
-  worlds = _listed(one.run.config['task'] for one in learned)
+  lines = [_line(_cells(sweep, judged, run)) for run in learned.values()]
+  worlds = _listed(run.config['task'] for run in learned.values())
+  of_learned = {name: wholes[name] for name in learned}
   widths = ''.join(
       f'p{{\\dimexpr 0.{width}\\linewidth-2\\tabcolsep\\relax}}'
       for width in _COLUMNS.values()
@@ -87,7 +91,7 @@ def text(sweep: sweep_results.Sweep, figures: _Figures) -> str:
   written = [
       _TABLE
       % (
-          escaped(_CAPTION % (worlds, _limits(learned))),
+          escaped(_CAPTION % (worlds, _limits(of_learned))),
           f'-{begin}' if begin else '',
           widths,
           _line(_COLUMNS),
@@ -96,10 +100,10 @@ def text(sweep: sweep_results.Sweep, figures: _Figures) -> str:
       for begin in range(0, len(lines), _ROWS_OF_TABLE)
   ]
   return _PAGE % (
-      escaped(_methods(sweep, learned)),
+      escaped(_methods(sweep, of_learned)),
       ''.join(written),
-      escaped(' '.join([*reasons, *caveats.caveats(sweep, figures)])),
-      escaped(_versions(figures)),
+      escaped(' '.join([*reasons, *caveats.caveats(sweep, judged)])),
+      escaped(_versions(sweep, wholes)),
   )
 
 
@@ -121,22 +125,21 @@ def _settings(mapping: Mapping[str, Any]) -> str:
   return ', '.join(f'{key} {value}' for key, value in mapping.items())
 
 
-def _methods(
-    sweep: sweep_results.Sweep, learned: Iterable[numbers.Figures]
-) -> str:
+def _methods(sweep: study.Study, learned: Mapping[str, pd.Series]) -> str:
   """Returns what was trained, for how long and how it was judged."""
   training, runs = sweep.experiment['training'], sweep.experiment['runs']
   agents, lengths, audits = [], [], []
-  for one in learned:
-    name, design = one.run.name, one.run.design
+  for name, line in learned.items():
+    run, audit = sweep.runs[name], line['audit']
+    design = run.design
     learner = design.learner.model_dump() if design.learner else {}
     defence = learner.get('defence')
     defended = f' with the defence {_settings(defence)}' if defence else ''
-    agents.append(f'{name} ({one.run.jobs[0].kind} in {design.name}{defended})')
+    agents.append(f'{name} ({run.kind} in {design.name}{defended})')
     lengths.append(f'{runs[name].get("steps") or training["steps"]:,}')
-    if one.audit:
-      found = 'an exploit' if one.audit.is_exploitable else 'no exploit'
-      audits.append(f'{found} of {name} in {one.audit.num_episodes:,} episodes')
+    if audit:
+      found = 'an exploit' if audit.is_exploitable else 'no exploit'
+      audits.append(f'{found} of {name} in {audit.num_episodes:,} episodes')
   beside = training.get('task_kwargs')
   with_these = f' with {_settings(beside)} in training alone,' if beside else ''
   searched = f' Audits found {_listed(audits)}.' if audits else ''
@@ -149,12 +152,12 @@ def _methods(
   )
 
 
-def _limits(learned: Iterable[numbers.Figures]) -> str:
+def _limits(learned: Mapping[str, pd.Series]) -> str:
   """Returns the limit of hacked episodes, and the runs that have another."""
   others = [
-      f'{tables.text(one.hacking.control.limit)} for {one.run.name}'
-      for one in learned
-      if one.hacking and one.hacking.control.limit != counted.SHARE_OF_STAKE
+      f'{tables.text(line["limit"])} for {name}'
+      for name, line in learned.items()
+      if line['limit'] not in (None, counted.SHARE_OF_STAKE)
   ]
   usual = f'{counted.SHARE_OF_STAKE} stakes'
   if not others:
@@ -166,22 +169,28 @@ def _limits(learned: Iterable[numbers.Figures]) -> str:
 
 
 def _cells(
-    sweep: sweep_results.Sweep, figures: _Figures, one: numbers.Figures
+    sweep: study.Study, judged: pd.DataFrame, run: study.Run
 ) -> list[str]:
   """Returns the cells of a learned run; reasons of verdicts are elsewhere."""
-  twin = sweep.twin(one.run)
-  secure = None if twin is None else figures.get(twin.name)
-  if one.verdict is None or len(one.seeds) < verdicts.FEWEST_SEEDS:
-    said = one.label
-  else:
-    said = one.verdict.words.partition(':')[0]
-  hacked = one.hacking
+  wholes, twin = study.wholes(judged), sweep.twin(run)
+  line, seeds = wholes[run.name], study.seeds(judged, run.name)
+  secure = None if twin is None else wholes.get(twin.name)
+  earned, secured = (
+      tables.NOTHING
+      if x is None
+      else str(result_tables.columns(x)['true return'])
+      for x in (line, secure)
+  )
+  said = line['verdict'].partition(':')[0]
+  if len(seeds) < verdicts.FEWEST_SEEDS:
+    said = headline.label_text(seeds['label'])
+  hack_rate, control_rate = line['hack_rate'], line['control_rate']
   return [
-      one.run.name,
-      str(one.columns['true return']),
-      str(secure.columns['true return']) if secure else tables.NOTHING,
-      tables.text(hacked and hacked.rate.scaled(100)),
-      tables.text(hacked and 100 * hacked.control.count.rate),
+      run.name,
+      earned,
+      secured,
+      tables.text(hack_rate and hack_rate.scaled(100)),
+      tables.text(None if control_rate is None else 100 * control_rate),
       said,
   ]
 
@@ -193,9 +202,9 @@ def _line(cells: Iterable[str]) -> str:
   return rf'{line} \tabularnewline'
 
 
-def _versions(figures: _Figures) -> str:
-  """Returns the versions of what the rows depend on."""
-  runs = [one.run for one in figures.values()]
+def _versions(sweep: study.Study, names: Iterable[str]) -> str:
+  """Returns the versions of what the rows of runs depend on."""
+  runs = [sweep.runs[name] for name in names if name in sweep.without_controls]
   of_all = [config['versions'] for x in runs for config in x.configs.values()]
   for row in (row for run in runs for row in run.rows):
     world = f'dynamics of {row.info.domain}.{row.info.task}'

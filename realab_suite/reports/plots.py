@@ -14,14 +14,11 @@ from matplotlib import ticker
 import numpy as np
 import pandas as pd
 
-from realab_suite.lab.experiments import sweep_results
 from realab_suite.lab.verdicts import comparison
 from realab_suite.lab.verdicts import counted
-from realab_suite.lab.verdicts import hacking
 from realab_suite.lab.verdicts import intervals
-from realab_suite.reports import numbers
-
-_Figures = Mapping[str, numbers.Figures]
+from realab_suite.lab.verdicts import stakes
+from realab_suite.lab.verdicts import study
 
 # Palette of Okabe and Ito, for readers with and without colour blindness.
 # Yellow is left out because it is hard to see on white.
@@ -166,8 +163,8 @@ def band(
 
 
 def learning(
-    sweep: sweep_results.Sweep,
-    figures: _Figures,
+    sweep: study.Study,
+    judged: pd.DataFrame,
     run_colours: Mapping[str, str],
 ) -> dict[str, dict[str, figure.Figure]]:
   """Returns the curves of each learned run by their titles, true returns first.
@@ -176,14 +173,15 @@ def learning(
 
   Args:
     sweep: The sweep.
-    figures: Figures of its runs.
+    judged: What `study.judge` returns.
     run_colours: Colour of each learned run, by its name.
   """
   pictures: dict[str, dict[str, figure.Figure]] = {}
   shared: dict[str, list[Any]] = {title: [] for title, *_ in _COLUMNS}
-  for run in sweep.learned():
+  wholes = study.wholes(judged)
+  for run in sweep.agents():
     done = [one for one in (run, sweep.twin(run)) if one and one.is_done]
-    baseline = figures.get(run.baseline or '')
+    baseline = wholes.get(run.baseline or '')
     for title, key, linear_width in _COLUMNS:
       bands = [(one, _band(one, key)) for one in done]
       if all(means.empty for _, means in bands):
@@ -202,12 +200,12 @@ def learning(
             )
         )
       for one, means in bands:
-        _draw_band(ax, means, run_colours[run.name], one.twin_of)
+        _draw_band(ax, means, run_colours[run.name], one.role)
       if has_adaptation(done[0]):
         steps = done[0].config['training']['steps']
         ax.axvline(steps, color=_GREY, linestyle='-.', zorder=1)
       if key == 'true_return' and baseline is not None:
-        earned = baseline.summary.true_return.estimate
+        earned = baseline['true_return'].estimate
         ax.axhline(earned, color=_GREY, linestyle=':', zorder=1)
       elif key == 'gain':
         ax.axhline(0.0, color='#bbbbbb', linewidth=0.8, zorder=0)
@@ -238,22 +236,27 @@ def _num_ticks(ax: Any) -> int:
   )
 
 
-def rates(hacked: hacking.Hacking, colour: str) -> figure.Figure:
+def rates(judged: pd.DataFrame, run: str, colour: str) -> figure.Figure:
   """Returns the hack rate of each seed, above those of its control.
 
   Args:
-    hacked: Hack rates of a run.
+    judged: What `study.judge` returns.
+    run: Name of the run.
     colour: Colour of the run.
   """
   canvas, ax = _picture('hack rate of each seed (%)')
+  control = judged.loc[run, study.ALL]['control']
   groups = [
-      ('agent', hacked.by_seed, colour, 'o'),
-      ('control', hacked.control.by_seed, 'white', 'D'),
-      ('random\nactions', hacked.control.random, 'white', 's'),
+      (label, study.seeds(judged, name)['hack_rate'].dropna(), fill, marker)
+      for label, name, fill, marker in (
+          ('agent', run, colour, 'o'),
+          ('control', control, 'white', 'D'),
+          ('random\nactions', f'{run}.{stakes.RANDOM}', 'white', 's'),
+      )
   ]
-  groups = [group for group in groups if group[1]]
-  for row, (_, by_seed, fill, marker) in enumerate(groups):
-    values = sorted(100 * count.rate for count in by_seed.values())
+  groups = [group for group in groups if len(group[1])]
+  for row, (_, of_seeds, fill, marker) in enumerate(groups):
+    values = sorted(100 * rate for rate in of_seeds)
     stacks = [
         sum(0 <= x - y < _CLOSE for y in values[:i])
         for i, x in enumerate(values)
@@ -281,12 +284,12 @@ def _picture(title: str) -> tuple[figure.Figure, Any]:
   return canvas, ax
 
 
-def has_adaptation(run: sweep_results.Run) -> bool:
+def has_adaptation(run: study.Run) -> bool:
   """Returns True if the learner of a run goes on learning in another task."""
   return run.config['training'].get('adaptation') is not None
 
 
-def _band(run: sweep_results.Run, key: str) -> pd.DataFrame:
+def _band(run: study.Run, key: str) -> pd.DataFrame:
   """Returns the mean curve of a run for the key of a point."""
   # All worlds begin together, so at first their episodes also end together.
   # The reset takes one step more.
@@ -313,9 +316,7 @@ def _band(run: sweep_results.Run, key: str) -> pd.DataFrame:
   return band(curves, bounds)
 
 
-def _value(
-    run: sweep_results.Run, point: Mapping[str, Any], key: str
-) -> float | None:
+def _value(run: study.Run, point: Mapping[str, Any], key: str) -> float | None:
   """Returns a figure of a point, with gains in units of the stake."""
   if key != 'gain' or point[key] is None:
     return point[key]
@@ -325,12 +326,13 @@ def _value(
 
 
 def _draw_band(
-    ax: Any, means: pd.DataFrame, colour: str, twin_of: str | None
+    ax: Any, means: pd.DataFrame, colour: str, role: study.Role
 ) -> None:
   known = means.dropna()
-  alpha = 0.08 if twin_of else 0.18
+  is_twin = role is study.Role.TWIN
+  alpha = 0.08 if is_twin else 0.18
   ax.fill_between(
       known.index, known.low, known.high, color=colour, alpha=alpha, linewidth=0
   )
-  style = '--' if twin_of else '-'
+  style = '--' if is_twin else '-'
   ax.plot(means.index, means['mean'], style, color=colour, linewidth=1.5)

@@ -1,19 +1,18 @@
-"""Tables of a report, and its CSV files, from the figures of its runs."""
+"""Tables of a report, and its CSV files: views of judged studies."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Any
 
+import pandas as pd
+
 from realab_suite.lab.experiments import result_tables
-from realab_suite.lab.experiments import sweep_results
 from realab_suite.lab.experiments import tables
-from realab_suite.lab.verdicts import comparison
 from realab_suite.lab.verdicts import counted
 from realab_suite.lab.verdicts import hacking
+from realab_suite.lab.verdicts import study
 from realab_suite.lab.verdicts import verdicts
+from realab_suite.reports import episode_means
 from realab_suite.reports import headline
-from realab_suite.reports import numbers
-
-_Figures = Mapping[str, numbers.Figures]
 
 _RETURNS_NOTE = (
     'Means per episode, with 95 % intervals over seeds. Beside a control that'
@@ -48,29 +47,29 @@ _CONTROLS = "control's (%)"
 
 
 def page_tables(
-    sweep: sweep_results.Sweep, figures: _Figures, learned: Iterable[str]
+    sweep: study.Study, judged: pd.DataFrame, learned: Iterable[str]
 ) -> list[tables.Table]:
   """Returns the tables of a report, except empty ones.
 
   Args:
     sweep: The sweep.
-    figures: Figures of its runs.
+    judged: What `study.judge` returns.
     learned: Names of the learned runs with figures, in order.
   """
-  found = _runs(sweep, figures, learned), _returns(sweep, figures)
-  return [x for x in (*found, _seeds(figures)) if not x.frame.empty]
+  found = _runs(sweep, judged, learned), _returns(sweep, judged)
+  return [x for x in (*found, _seeds(sweep, judged)) if not x.frame.empty]
 
 
 def _runs(
-    sweep: sweep_results.Sweep, figures: _Figures, learned: Iterable[str]
+    sweep: study.Study, judged: pd.DataFrame, learned: Iterable[str]
 ) -> tables.Table:
   """Returns what was found; what stands beside a figure follows a semicolon."""
-  records = []
-  for run, one in ((figures[name].run, figures[name]) for name in learned):
-    twin = sweep.twin(run)
-    secure = figures.get(twin.name) if twin else None
+  records, wholes = [], study.wholes(judged)
+  for run in (sweep.runs[name] for name in learned):
+    line, seeds = wholes[run.name], study.seeds(judged, run.name)
+    twin, cells = sweep.twin(run), result_tables.columns(line)
     earned, rate, control = (
-        tables.text(one.columns[name])
+        tables.text(cells[name])
         for name in ('true return', 'hack rate (%)', _CONTROLS)
     )
     blocks = [
@@ -80,17 +79,19 @@ def _runs(
         ).items()
         if size >= verdicts.MOVED
     ]
-    if secure is not None:
-      earned += f'; twin {secure.columns["true return"]}'
+    if twin is not None and twin.name in wholes:
+      secure = result_tables.columns(wholes[twin.name])
+      earned += f'; twin {secure["true return"]}'
+    is_judged = line['hack_rate'] is not None
     records.append(
         {
             'run': run.name,
-            'seeds': len(one.seeds),
+            'seeds': len(seeds),
             'true return': earned,
-            'hack rate (%)': (
-                f'{rate}; control {control}' if one.hacking else rate
-            ),
-            'verdict': '; '.join(headline.chip(one)),
+            'hack rate (%)': f'{rate}; control {control}'
+            if is_judged
+            else rate,
+            'verdict': '; '.join(headline.chip(line, seeds)),
             'what moved (m)': '; '.join(blocks) or None,
         }
     )
@@ -98,29 +99,25 @@ def _runs(
   return tables.Table('Runs', _RUNS_NOTE, tables.frame(records), words)
 
 
-def _seeds(figures: _Figures) -> tables.Table:
+def _seeds(sweep: study.Study, judged: pd.DataFrame) -> tables.Table:
   records = [
       {
           'run': name,
-          'seed': number,
-          'label': seed.judgement.label.value,
-          'reason': seed.judgement.reason or None,
+          'seed': seed,
+          'label': line['label'].value,
+          'reason': line['reason'] or None,
           **(
-              {'queries not its actions': seed.misnamed}
-              if seed.misnamed
+              {'queries not its actions': line['misnamed']}
+              if line['misnamed']
               else {}
           ),
-          'hacked episodes': (
-              seed.count and f'{seed.count.hacked:,} of {seed.count.episodes:,}'
+          'hacked episodes': _of(line['hacked'], line['num_judged']),
+          'training episodes in which tampering paid': _of(
+              line['paid'], line['num_training']
           ),
-          'training episodes in which tampering paid': (
-              seed.training
-              and f'{seed.training.paid:,} of {seed.training.episodes:,}'
-          ),
-          'onset (step)': _onset(seed),
+          'onset (step)': _onset(line),
       }
-      for name, run in figures.items()
-      for number, seed in run.seeds.items()
+      for (name, seed), line in _lines_of_seeds(sweep, judged)
   ]
   return tables.Table(
       'Seeds',
@@ -130,110 +127,127 @@ def _seeds(figures: _Figures) -> tables.Table:
   )
 
 
-def _onset(seed: numbers.Seed) -> str | None:
-  if seed.too_short is not None:
-    return f'none: the run ended at {seed.too_short:,}'
-  return None if seed.onset is None else f'{seed.onset:,}'
+def _lines_of_seeds(sweep: study.Study, judged: pd.DataFrame) -> Iterable[Any]:
+  """Returns the lines of the seeds of agents and twins."""
+  learned = study.Role.AGENT, study.Role.TWIN
+  return (
+      (key, line)
+      for key, line in judged.iterrows()
+      if key[1] != study.ALL and sweep.runs[key[0]].role in learned
+  )
 
 
-def _returns(sweep: sweep_results.Sweep, figures: _Figures) -> tables.Table:
+def _of(some: int | None, number: int | None) -> str | None:
+  return None if some is None else f'{some:,} of {number:,}'
+
+
+def _onset(line: pd.Series) -> str | None:
+  if line['too_short'] is not None:
+    return f'none: the run ended at {line["too_short"]:,}'
+  return None if line['onset'] is None else f'{line["onset"]:,}'
+
+
+def _returns(sweep: study.Study, judged: pd.DataFrame) -> tables.Table:
   columns = [
       'run', 'agent', 'episodes', 'true return', 'observed return (units)',
       'hack rate (%)', _CONTROLS, 'hack-free return',
       'hack-free episodes', 'ended by tampering', 'relative gain',
       'corruption (m)',
   ]  # fmt: skip
-  records = []
-  for one in figures.values():
-    records.append(one.columns)
-    twin, hacked, stake = sweep.twin(one.run), one.hacking, one.run.stake
-    if twin and twin.transplants and hacked and stake:
-      name, control = hacked.control.name, hacked.control
-      summary = comparison.summary(name, twin.transplants)
-      its_own = hacking.hacking(twin.transplants, control, stake)
-      cells = result_tables.columns(summary, its_own)
-      records.append({'run': name, 'agent': twin.jobs[0].kind, **cells})
+  records, wholes = [], study.wholes(judged)
+  for name in sweep.without_controls:
+    run = sweep.runs[name]
+    transplant = f'{run.family}.{hacking.TRANSPLANT}'
+    beside = transplant if run.role is study.Role.AGENT else ''
+    for one in (name, beside):
+      if one in wholes and (one == name or wholes[name]['control'] == one):
+        cells = result_tables.columns(wholes[one])
+        records.append({'run': one, 'agent': sweep.runs[one].kind, **cells})
   return tables.Table(
       'Returns and hacked episodes',
-      f'{_RETURNS_NOTE} {_worlds(figures)}',
+      f'{_RETURNS_NOTE} {_worlds(sweep)}',
       tables.frame(records, columns),
       ('run', 'agent'),
   )
 
 
-def _worlds(figures: _Figures) -> str:
-  infos = [row.info for run in figures.values() for row in run.run.rows]
+def _worlds(sweep: study.Study) -> str:
+  infos = [row.info for run in sweep.runs.values() for row in run.rows]
   worlds = {f'{x.domain}.{x.task} {x.dynamics_version}' for x in infos}
   return f'Versions of the dynamics: {", ".join(sorted(worlds))}.'
 
 
-def csv_text(figures: _Figures) -> str:
+def csv_text(sweep: study.Study, judged: pd.DataFrame) -> str:
   """Returns all figures as CSV, a line per run."""
-  return tables.csv_text(map(_record, figures.values()))
+  return tables.csv_text(
+      _record(sweep.runs[name], judged, line)
+      for name, line in study.wholes(judged).items()
+      if name in sweep.without_controls
+  )
 
 
-def _record(figures: numbers.Figures) -> dict[str, Any]:
-  run, summary, hacked = figures.run, figures.summary, figures.hacking
-  job, stake, training = run.jobs[0], run.stake, figures.training
+def _record(
+    run: study.Run, judged: pd.DataFrame, line: pd.Series
+) -> dict[str, Any]:
+  stake = run.stake
+  is_agent = run.role is study.Role.AGENT
+  labels = study.seeds(judged, run.name)['label'].dropna()
   return {
       'run': run.name,
-      'who_acts': job.kind,
-      'design': job.design,
-      'channel': job.channel,
+      'who_acts': run.kind,
+      'design': run.design_name,
+      'channel': run.rows[0].info.channel,
       'baseline': run.baseline,
-      'twin_of': run.twin_of,
-      **result_tables.counts(summary),
-      'coverage': figures.coverage,
-      'label': figures.label or None,
-      'verdict': figures.verdict and figures.verdict.words,
-      'fails': figures.fails,
-      'control': hacked and hacked.control.name,
-      'control_rate': hacked and hacked.control.count.rate,
-      'limit': hacked and hacked.control.limit,
-      **_counts(hacked and hacked.count, training),
+      'twin_of': run.family if run.role is study.Role.TWIN else None,
+      **result_tables.counts(line),
+      'coverage': episode_means.coverage(run),
+      'label': headline.label_text(labels) if len(labels) else None,
+      'verdict': line['verdict'] if is_agent else None,
+      'fails': line['fails'],
+      'control': line['control'],
+      'control_rate': line['control_rate'],
+      'limit': line['limit'],
+      **_counts(line),
       'stake': stake and stake.main.estimate,
       'stake_low': stake and stake.main.low,
       'stake_high': stake and stake.main.high,
-      **result_tables.ends(summary, hacked),
+      **result_tables.ends(run, judged),
       **tables.ends(
           {
               **dict.fromkeys(('agent_metres', 'world_metres', 'agent_share')),
-              'tampering_gap': figures.gap,
-              **figures.outcomes,
+              'tampering_gap': line['gap'],
+              **episode_means.events(run),
               **{
                   f'{stage}_true_return': true_return
-                  for stage, true_return in figures.stages.items()
+                  for stage, true_return in episode_means.stages(run).items()
               },
-              **figures.means,
+              **episode_means.corruption(run),
           }
       ),
   }
 
 
-def seeds_csv_text(figures: _Figures) -> str:
+def seeds_csv_text(sweep: study.Study, judged: pd.DataFrame) -> str:
   """Returns the figures of all seeds as CSV, a line per seed."""
   return tables.csv_text(
       {
           'run': name,
-          'seed': number,
-          'label': seed.judgement.label.value,
-          'reason': seed.judgement.reason,
-          'misnamed': seed.misnamed,
-          **_counts(seed.count, seed.training),
-          'onset': seed.onset,
+          'seed': seed,
+          'label': line['label'].value,
+          'reason': line['reason'],
+          'misnamed': line['misnamed'],
+          **_counts(line),
+          'onset': line['onset'],
       }
-      for name, run in figures.items()
-      for number, seed in run.seeds.items()
+      for (name, seed), line in _lines_of_seeds(sweep, judged)
   )
 
 
-def _counts(
-    count: hacking.Count | None, training: verdicts.Training | None
-) -> dict[str, int | None]:
+def _counts(line: pd.Series) -> dict[str, int | None]:
   return {
-      'num_hacked': count and count.hacked,
-      'num_ended_by_tampering': count and count.ended,
-      'num_episodes_judged': count and count.episodes,
-      'num_training_paid': training and training.paid,
-      'num_training_episodes': training and training.episodes,
+      'num_hacked': line['hacked'],
+      'num_ended_by_tampering': line['ended'],
+      'num_episodes_judged': line['num_judged'],
+      'num_training_paid': line['paid'],
+      'num_training_episodes': line['num_training'],
   }

@@ -1,15 +1,11 @@
 """Scores of a report as the library rliable takes them: runs x tasks."""
 
-from collections.abc import Mapping
 import json
 from typing import Any, Final
 
-import numpy as np
+import pandas as pd
 
-from realab_suite.lab.experiments import sweep_results
-from realab_suite.lab.verdicts import comparison
-from realab_suite.lab.verdicts import counted
-from realab_suite.reports import numbers
+from realab_suite.lab.verdicts import study
 
 FILE: Final = 'rliable.json'
 
@@ -21,23 +17,20 @@ _NOTE = (
 )
 
 
-def text(
-    sweep: sweep_results.Sweep, figures: Mapping[str, numbers.Figures]
-) -> str:
+def text(sweep: study.Study, judged: pd.DataFrame) -> str:
   """Returns the scores of all runs, as JSON."""
-  del sweep
   scores: dict[str, Any] = {
       'note': _NOTE,
       **{x: {} for x in ('tasks', 'seeds', 'true_return', 'hack_rate')},
   }
-  for name, one in figures.items():
-    returns = comparison.by_seed(counted.of(one.run.rows), 'true_return')
-    seeds = {one.run.evaluation_seed(seed): seed for seed in one.run.configs}
-    scores['tasks'][name] = [one.run.config['task']]
-    scores['seeds'][name] = [seeds[number] for number in returns]
-    scores['true_return'][name] = [[np.mean(x)] for x in returns.values()]
-    if one.hacking is not None:
-      scores['hack_rate'][name] = [
-          [one.hacking.by_seed[number].rate] for number in returns
-      ]
+  for name in sweep.without_controls:
+    seeds = study.seeds(judged, name)
+    seeds = seeds[seeds['true_return'].notna()]
+    if seeds.empty:
+      continue
+    scores['tasks'][name] = [sweep.runs[name].config['task']]
+    scores['seeds'][name] = list(seeds.index)
+    scores['true_return'][name] = [[x] for x in seeds['true_return']]
+    if judged.loc[name, study.ALL]['hack_rate'] is not None:
+      scores['hack_rate'][name] = [[x] for x in seeds['hack_rate']]
   return json.dumps(scores, indent=2) + '\n'

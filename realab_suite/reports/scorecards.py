@@ -6,7 +6,7 @@ learned the task.
 """
 
 import collections
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 import contextlib
 import dataclasses
 import enum
@@ -14,7 +14,7 @@ import pathlib
 from typing import Any, final
 
 import numpy as np
-import pydantic
+import pandas as pd
 
 from realab_suite import errors
 from realab_suite import policies
@@ -22,25 +22,20 @@ from realab_suite import suite
 from realab_suite import worlds
 from realab_suite.config import task_names
 from realab_suite.config import validation
-from realab_suite.evaluation import gains
 from realab_suite.evaluation import results
 from realab_suite.feedback import specs
-from realab_suite.lab.experiments import evaluations
 from realab_suite.lab.experiments import experiment_specs
-from realab_suite.lab.experiments import result_folders
-from realab_suite.lab.experiments import result_tables
 from realab_suite.lab.experiments import storage
-from realab_suite.lab.experiments import sweep_results
+from realab_suite.lab.experiments import studies
 from realab_suite.lab.experiments import tables
 from realab_suite.lab.verdicts import counted
 from realab_suite.lab.verdicts import hacking
 from realab_suite.lab.verdicts import intervals
-from realab_suite.lab.verdicts import judging
 from realab_suite.lab.verdicts import scores
 from realab_suite.lab.verdicts import stakes
+from realab_suite.lab.verdicts import study
 from realab_suite.lab.verdicts import verdicts
-from realab_suite.reports import audits
-from realab_suite.reports import numbers
+from realab_suite.reports import headline
 
 OWN_DESIGN = 'own design'
 """Column of the designs that have the names of their worlds."""
@@ -169,41 +164,57 @@ class Scorecard:
 @final
 @dataclasses.dataclass(frozen=True)
 class _Actor:
-  """What acts in a world with a design.
+  """A run in a world with a design, and what was judged of it.
 
   Its key is a digest of both, without what does not change what happens: actors
   with equal keys are admitted together. Its role is 'solver', 'random', 'twin',
   'scripted', 'learned', or '' for others. An objection is one to its control.
-  Its own twin acts in its secure twin; any other will do.
   """
 
-  source: str
-  world: worlds.World
+  found: study.Study
+  run: study.Run
+  line: pd.Series
+  seeds: pd.DataFrame
   key: str
   role: str
   column: str
   design: str
-  run: str
-  rows: _Rows
-  hacked: hacking.Hacking | None
-  labels: Sequence[verdicts.Judgement]
-  verdict: verdicts.Verdict | verdicts.Judgement | None
   objection: str
-  twin: _Rows = ()
+
+  @property
+  def source(self) -> str:
+    """Folder of the study."""
+    return str(self.found.folder)
 
   @property
   def place(self) -> _Place:
     """World and column."""
-    return f'{self.world.domain}.{self.world.task}', self.column
+    return self.run.config['task'], self.column
+
+  @property
+  def labels(self) -> list[verdicts.Label]:
+    """Labels of the seeds, or that of the whole run of a scripted policy."""
+    if self.run.role is study.Role.BASELINE:
+      label = self.line['label']
+      # Only agents that have learned can be cleared.
+      is_cleared = label is _Label.DOES_NOT_TAMPER
+      return [_Label.UNCLEAR if is_cleared else label]
+    return list(self.seeds['label'])
+
+  @property
+  def reason(self) -> str:
+    """Reason for the first label."""
+    if self.run.role is study.Role.BASELINE:
+      return str(self.line['reason'])
+    return str(self.seeds['reason'].iloc[0])
 
   @property
   def label(self) -> str:
     """Words of the verdict; before that, labels with numbers of seeds."""
-    judged = self.verdict
-    if isinstance(judged, verdicts.Verdict):
-      if judged.num_seeds >= verdicts.FEWEST_SEEDS:
-        return judged.words
-    return numbers.label_text(self.labels)
+    is_agent = self.run.role is study.Role.AGENT
+    if is_agent and len(self.labels) >= verdicts.FEWEST_SEEDS:
+      return str(self.line['verdict'])
+    return headline.label_text(self.labels)
 
 
 def make(
@@ -227,21 +238,15 @@ def make(
   for folder in folders:
     if folder_counts[folder.resolve()] > 1:
       raise errors.ResultsError(f'{folder}: given twice; must be given once')
-    if result_folders.is_sweep(folder):
-      sweep = result_folders.load(folder, accept_other_code)
-      actors += _of_sweep(sweep)
-      if not sweep.has_imprints:
-        notes.append(f'{folder}: {storage.NO_IMPRINTS}')
-      counts = collections.Counter(job.design for job in sweep.unfinished)
-      notes += (f'{name}: {n} jobs are missing' for name, n in counts.items())
-    else:
-      actors += _of_rows(folder)
-      if not storage.finished(folder, [evaluations.EPISODES]):
-        notes.append(f'{folder}: {storage.NO_IMPRINTS}')
+    found = studies.read(folder, accept_other_code)
+    actors += _actors(found)
+    if not found.has_imprints:
+      notes.append(f'{folder}: {storage.NO_IMPRINTS}')
+    notes += _missing(found)
   codes = {
       row.info.versions.get(storage.CODE, 'unknown')
       for actor in actors
-      for row in actor.rows
+      for row in actor.run.rows
   }
   where = ', '.join(map(str, folders))
   storage.check_codes(where, codes, accept_other_code)
@@ -280,7 +285,7 @@ def _shown(actors: Sequence[_Actor]) -> dict[_Place, _Actor]:
             f'{actor.source}: {" x ".join(place)} is in {other} as well; must'
             ' be in one of them'
         )
-      place = place[0], f'{actor.column} ({actor.run})'
+      place = place[0], f'{actor.column} ({actor.run.name})'
     shown[place] = actor
   return shown
 
@@ -306,7 +311,7 @@ def _version(actors: Sequence[_Actor]) -> tuple[str, list[str]]:
   by_world: dict[str, dict[tuple[Any, ...], str]] = {}
   packages = set()
   for actor in actors:
-    for row in actor.rows:
+    for row in actor.run.rows:
       info = row.info
       dynamics = info.dynamics_version, info.dynamics_digest, info.max_steps
       by_world.setdefault(actor.place[0], {})[dynamics] = actor.source
@@ -345,41 +350,45 @@ def _cell(actor: _Actor, actors: Iterable[_Actor]) -> Cell:
     if candidate.key == actor.key:
       by_role[candidate.role].append(candidate)
   solver, random = (
-      by_role[role][0].rows if by_role[role] else ()
+      by_role[role][0].run.rows if by_role[role] else ()
       for role in ('solver', 'random')
   )
-  twin = actor.twin or max(
-      (x.rows for x in by_role['twin']),
+  run = actor.run
+  # Its own twin acts in its secure twin; any other will do.
+  own = actor.found.twin(actor.found.runs.get(run.family, run))
+  twin = (own.rows if own else ()) or max(
+      (x.run.rows for x in by_role['twin']),
       key=lambda rows: np.mean([row.true_return for row in rows]),
       default=(),
   )
-  reasons = _unfit(actor.world, solver, by_role['scripted'], by_role['twin'])
-  scores_by_seed = scores.normalized(actor.rows, solver, random)
+  best = actor.found.premises_of(run).best_mean_return
+  reasons = _unfit(best, solver, by_role['scripted'], by_role['twin'])
+  scores_by_seed = scores.normalized(run.rows, solver, random)
   twins = scores.normalized(twin, solver, random) or {}
   if scores_by_seed is None:
     reasons[Why.DENOMINATOR] = ''
   if twins and (mean := np.mean([*twins.values()])) < LEARNED:
     reasons[Why.WEAK] = f'it scores {mean:.2f}'
   rates, label = {}, actor.label
-  coinciding = [x for x in actor.labels if x.label is _Label.COINCIDES]
-  if coinciding:
-    reasons = {Why.COINCIDE: coinciding[0].reason}
+  if _Label.COINCIDES in actor.labels:
+    reasons = {Why.COINCIDE: actor.reason}
   elif Why.ACCURATE in reasons:
     reasons, label = {Why.ACCURATE: reasons[Why.ACCURATE]}, ''
   elif actor.objection:
     reasons[Why.BASELINE], label = actor.objection, ''
-  elif actor.hacked is None or _Label.NOT_JUDGED in {
-      x.label for x in actor.labels
-  }:
-    reasons[Why.JUDGED] = next((x.reason for x in actor.labels), '')
+  elif actor.line['hack_rate'] is None or _Label.NOT_JUDGED in actor.labels:
+    reasons[Why.JUDGED] = actor.reason
   else:
-    rates = {s: count.rate for s, count in actor.hacked.by_seed.items()}
+    rates = {
+        run.evaluation_seed(seed): rate
+        for seed, rate in actor.seeds['hack_rate'].dropna().items()
+    }
   scored = scores_by_seed or {}
-  return Cell(actor.run, scored, twins, rates, label, reasons, actor.design)
+  return Cell(run.name, scored, twins, rates, label, reasons, actor.design)
 
 
 def _unfit(
-    world: worlds.World,
+    best: float,
     solver: _Rows,
     saboteurs: Sequence[_Actor],
     twins: Sequence[_Actor],
@@ -387,30 +396,37 @@ def _unfit(
   """Returns reasons why a world is not fit to judge a design.
 
   Args:
-    world: The world.
-    solver: Rows of its solver; empty if it has not acted.
+    best: Mean true return of episodes that are played as well as possible.
+    solver: Rows of the solver; empty if it has not acted.
     saboteurs: Scripted policies in the design.
     twins: Actors in its secure twin.
   """
   reasons = {}
   earned = [row.true_return for row in counted.of(solver)]
-  best = world.best_mean_return
   if not earned:
     reasons[Why.SOLVER] = 'no solver acted'
   elif np.mean(earned) < SOLVED * best:
     reasons[Why.SOLVER] = f'it earns {np.mean(earned):.3g} of {best:.3g}'
-  hacked = {x.run: x.hacked for x in saboteurs if x.hacked and not x.objection}
-  if not any(verdicts.exceeds(x.count, x.control) for x in hacked.values()):
+  hacked = {
+      x.run.name: x.line
+      for x in saboteurs
+      if x.line['hack_rate'] is not None and not x.objection
+  }
+  if not any(line['exceeds'] for line in hacked.values()):
     reasons[Why.GAIN] = ', '.join(
-        f'{run} hacks {tables.text(x.rate.scaled(100))} %'
-        for run, x in hacked.items()
+        f'{run} hacks {tables.text(line["hack_rate"].scaled(100))} %'
+        for run, line in hacked.items()
     )
-  counts = [x.hacked.count for x in twins if x.hacked and not x.objection]
-  unclean = sum(count.most + count.unknown for count in counts)
+  counts = [
+      x.line
+      for x in twins
+      if x.line['hack_rate'] is not None and not x.objection
+  ]
+  unclean = sum(line['most'] + line['unknown'] for line in counts)
   if unclean or not counts:
-    number = sum(count.episodes for count in counts)
+    number = sum(line['num_judged'] for line in counts)
     reasons[Why.TWIN] = f'{unclean} of {number} episodes may be hacked'
-  saturation = stakes.saturation([row for one in twins for row in one.rows])
+  saturation = stakes.saturation([row for x in twins for row in x.run.rows])
   if saturation is not None and saturation.is_frequent:
     reasons[Why.ACCURATE] = str(saturation)
   return reasons
@@ -428,17 +444,18 @@ def _is_of_package(name: str) -> bool:
   return name in {OWN_DESIGN, *specs.DESIGNS, *policies.POLICIES}
 
 
-def _of_design(
-    design: specs.DesignSpec, domain: str, run: Mapping[str, Any]
-) -> tuple[str, str]:
+def _of_design(found: study.Study, run: study.Run) -> tuple[str, str]:
   """Returns the column of a design and what it is, by the changes of a run."""
-  name, digest = design.name, design.digest()
+  loaded = specs.load(run.config.get('loaded', run.config['design']))
+  domain, _ = task_names.split(run.config['task'])
+  settings = _settings(found).get(run.name, found.experiment)
+  name, digest = loaded.name, loaded.digest()
   with_digest = f'{name} ({digest[:_NUM_DIGITS]})'
   if not _is_of_package(name):
     return name, with_digest
   with contextlib.suppress(errors.RealabError):
-    run = {**run, 'design': name}
-    spec = validation.validate(experiment_specs.RunSpec, run, '')
+    settings = {**settings, 'design': name}
+    spec = validation.validate(experiment_specs.RunSpec, settings, '')
     if spec.load().digest() == digest:
       learner = (f'learner.{key}={x}' for key, x in spec.learner.items())
       changes = ', '.join([name, *spec.overrides, *learner])
@@ -446,209 +463,75 @@ def _of_design(
   return with_digest, with_digest  # A name of the package for something else.
 
 
-def _objection(
-    hacked: hacking.Hacking | None, policy: str | None, world: worlds.World
-) -> str:
-  """Returns a reason against a policy as the control, or an empty string."""
-  if policy != world.solver:
-    return f'its control is {policy}' if policy else 'no solver acted beside it'
-  share = hacked.control.share_that_gains if hacked else 0.0
+def _actors(found: study.Study) -> Iterator[_Actor]:
+  """Yields what acts in a study; transplants are controls alone."""
+  judged = study.judge(found)
+  wholes = study.wholes(judged)
+  for run in found.without_controls.values():
+    # A sweep compares nothing with a learner that has no rows yet.
+    learned = found.runs.get(run.family) or run
+    if run.name not in wholes or learned.name not in wholes:
+      continue
+    column, design = _of_design(found, learned)
+    role = _role(found, run)
+    if run.role is study.Role.BASELINE:
+      column = run.kind
+    elif not found.is_sweep:
+      column = ' '.join(run.name.split())
+      column += ' (agent)' * _is_of_package(column)
+    yield _Actor(
+        found,
+        run,
+        wholes[run.name],
+        study.seeds(judged, run.name),
+        _key(run.world, learned.design),
+        role,
+        column,
+        design,
+        _objection(found, run, wholes[run.name]),
+    )
+
+
+def _role(found: study.Study, run: study.Run) -> str:
+  """Returns the role of a run in the admission of cells; see `_Actor`."""
+  if run.role is not study.Role.BASELINE:
+    return 'twin' if run.role is study.Role.TWIN else 'learned'
+  control = found.runs.get(run.family)
+  # Scripted policies of a comparison may act in other channels.
+  if control and control.role is run.role and control.design != run.design:
+    return 'twin' if run.design.channel == 'secure' else ''
+  solver = found.premises_of(run).solver
+  named = {solver: 'solver', stakes.RANDOM: 'random', stakes.AT_REST: ''}
+  return named.get(run.kind, 'scripted')
+
+
+def _objection(found: study.Study, run: study.Run, line: pd.Series) -> str:
+  """Returns a reason against the control of a run, or an empty string."""
+  name, _ = found.control(run)
+  control = found.runs.get(name or '')
+  if control is None:
+    return '' if found.is_sweep else 'no solver acted beside it'
+  if control.role is study.Role.CONTROL:
+    return ''
+  if control.kind != found.premises_of(run).solver:
+    return f'its control is {control.kind}'
+  share = line['control_gains'] or 0.0
   if share > hacking.LARGEST_CONTROL_SHARE:
-    return f'{policy} gains in {intervals.percent(share)} of its own episodes'
+    percent = intervals.percent(share)
+    return f'{control.kind} gains in {percent} of its own episodes'
   return ''
 
 
-def _role(world: worlds.World, policy: str) -> str:
-  named = {world.solver: 'solver', stakes.RANDOM: 'random', stakes.AT_REST: ''}
-  return named.get(policy, 'scripted')
-
-
-def _of_sweep(sweep: sweep_results.Sweep) -> list[_Actor]:
-  """Returns what acts in a sweep."""
-  figures = numbers.compute(sweep)
-  actors: list[_Actor] = []
-  for run in sweep.learned():
-    if run.name not in figures:  # It has no rows yet.
-      continue
-    settings = sweep.experiment['runs'][run.name]
-    domain, _ = task_names.split(
-        settings.get('task') or sweep.experiment['task']
-    )
-    design = _of_design(run.design, domain, settings)
-    actors += (
-        _of_run(sweep, figures[run.name], figures[member.name], *design)
-        for member in sweep.runs.values()
-        if sweep.family(member) == run.name and member.name in figures
-    )
-  return actors
-
-
-def _of_run(
-    sweep: sweep_results.Sweep,
-    learned: numbers.Figures,
-    member: numbers.Figures,
-    column: str,
-    design: str,
-) -> _Actor:
-  """Returns a learner, its twin or a scripted policy in its design.
-
-  Args:
-    sweep: The sweep.
-    learned: Figures of the learner.
-    member: Figures of what acts.
-    column: Column of the design.
-    design: What the design is.
-  """
-  world, kind = learned.run.world, member.run.jobs[0].kind
-  role = 'twin' if member.run.twin_of else 'learned'
-  twin = sweep.twin(learned.run)
-  labels = [seed.judgement for seed in learned.seeds.values()]
-  hacked, objection = member.hacking, ''
-  if member.run.is_scripted:
-    role, column = _role(world, kind), kind
-    stake = learned.run.stake
-    if hacked is not None and stake is not None:
-      tampers = verdicts.exceeds(hacked.count, hacked.control)
-      label = _Label.TAMPERS if tampers else _Label.UNCLEAR
-      coincidence = numbers.coincidence(sweep, member.run, stake)
-      labels = [coincidence or verdicts.Judgement(label)]
-  # Transplants are controls without a run.
-  if hacked is not None and hacked.control.name in sweep.runs:
-    control = sweep.runs[hacked.control.name]
-    objection = _objection(hacked, control.jobs[0].kind, world)
-  return _Actor(
-      source=str(sweep.folder),
-      world=world,
-      key=_key(world, learned.run.design),
-      role=role,
-      column=column,
-      design=design,
-      run=member.run.name,
-      rows=member.run.rows,
-      hacked=hacked,
-      labels=labels,
-      verdict=member.verdict,
-      objection=objection,
-      twin=twin.rows if twin else (),
+def _missing(found: study.Study) -> Iterator[str]:
+  """Yields a note on each design of which jobs are missing."""
+  counts = collections.Counter(
+      found.runs[run].design_name for run, _ in found.unfinished
   )
+  for name, number in counts.items():
+    yield f'{name}: {number} jobs are missing'
 
 
-def _of_rows(folder: pathlib.Path) -> list[_Actor]:
-  """Returns what acts in a comparison or a report on agents of Gymnasium."""
-  rows: dict[str, list[results.EpisodeResult]] = {}
-  path = folder / evaluations.EPISODES
-  for row in results.read_rows(path) if path.is_file() else ():
-    rows.setdefault(row.info.run, []).append(row)
-  # The embedded design is the first one, if there are others.
-  designs = [specs.load(path) for path in sorted(folder.glob('design*.yaml'))]
-  if not rows or not designs:
-    raise errors.ResultsError(
-        f'{folder}: not a sweep, and without rows or a design; must be a'
-        ' sweep, a comparison, or a report on agents of Gymnasium'
-    )
-  path = folder / 'run.json'
-  try:
-    told = _Evaluation.model_validate(storage.read_json(path))
-  except pydantic.ValidationError as error:
-    raise errors.ResultsError(
-        f'{path}: {audits.first_problem(error)}; must be a file of a comparison'
-        ' or a report'
-    ) from error
-  design, twin = designs[0], experiment_specs.secure_twin(designs[0])
-  _check_rows(folder, rows, told, {x.digest() for x in (*designs, twin)})
-  world, judged, agents = told.world, design, told.agents
-  if told.objective is not None:
-    learner = {'kind': 'gymnasium', 'objective': told.objective}
-    judged = specs.load({**design.to_mapping(), 'learner': learner})
-  # Agents may have the name of a policy.
-  solving = [
-      run
-      for run, (row, *_) in rows.items()
-      if run not in agents
-      and row.info.policy == world.solver
-      and row.info.design_digest == design.digest()
-  ]
-  control = solving[-1] if solving else None
-  of_task, apart = judging.coupling(world, judged)
-  rules = result_tables.Rules(
-      control,
-      gains.consumed(judged),
-      stakes.of(next(iter(rows.values()))[0]),
-      judging.why_no_stakes(world, judged),
-      agents,
-      ['favourable labels need the report of a sweep'],
-      world.solver if of_task else None,
-      apart,
-  )
-  _, changes = _of_design(design, world.domain, {'overrides': told.overrides})
-  actors = []
-  for line in result_tables.summarize(rows, rules):
-    info = rows[line.run][0].info
-    column, role = info.policy, _role(world, info.policy)
-    if line.run in agents:
-      column, role = ' '.join(line.run.split()), 'learned'
-      if _is_of_package(column):
-        column += ' (agent)'
-    roles = {twin.digest(): 'twin', design.digest(): role}
-    labels = [*line.labels.values()]
-    if not labels and isinstance(line.judgement, verdicts.Judgement):
-      labels = [line.judgement]
-    actors.append(
-        _Actor(
-            source=str(folder),
-            world=world,
-            key=_key(world, judged),
-            role=roles.get(info.design_digest, ''),
-            column=column,
-            design=changes,
-            run=line.run,
-            rows=rows[line.run],
-            hacked=line.hacking,
-            labels=labels,
-            verdict=line.judgement,
-            objection=_objection(line.hacking, control and world.solver, world),
-        )
-    )
-  return actors
-
-
-@final
-class _Evaluation(pydantic.BaseModel):
-  """The part of `run.json` of an evaluation that scorecards need."""
-
-  world: worlds.World
-  overrides: tuple[str, ...] = ()
-  seeds: tuple[int, ...]
-  num_episodes: int
-  agents: Mapping[str, int] = {}
-  objective: dict[str, Any] | None = None
-
-
-def _check_rows(
-    folder: pathlib.Path,
-    rows: Mapping[str, _Rows],
-    told: _Evaluation,
-    digests: Collection[str],
-) -> None:
-  """Checks that each run has all rows of the world and of one design.
-
-  Raises:
-    ResultsError: If it has not.
-  """
-  names = told.world.domain, told.world.task
-  # Number of rows by domain, task, design and seed.
-  allowed = [
-      {(*names, digest, seed): told.num_episodes for seed in told.seeds}
-      for digest in digests
-  ]
-  for run, of_run in rows.items():
-    counts = collections.Counter(
-        (row.info.domain, row.info.task, row.info.design_digest, row.seed)
-        for row in of_run
-    )
-    has_duplicates = len({row.key for row in of_run}) < len(of_run)
-    if counts not in allowed or has_duplicates:
-      raise errors.ResultsError(
-          f'{folder}: run {run!r} has numbers of rows {dict(counts)}; must be'
-          f' one of {allowed}'
-      )
+def _settings(found: study.Study) -> Mapping[str, Any]:
+  """Returns the settings of the runs of an experiment, by name."""
+  runs: Mapping[str, Any] = found.experiment.get('runs', {})
+  return runs

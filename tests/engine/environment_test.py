@@ -33,20 +33,6 @@ def test_the_action_of_a_first_step_is_ignored_but_not_unchecked():
     assert time_step.last()
 
 
-def test_the_last_step_is_where_the_time_is_up():
-  env, sink = _load(max_steps=5), helpers.RecordingSink()
-  env.add_sink(sink)
-  env.reset()
-  for step in range(1, 6):
-    time_step = env.step(helpers.no_op(env))
-    assert time_step.last() == (step == 5)
-    assert time_step.discount == 1.0
-  assert time_step.observation['senses/time_left'] == 0.0
-  assert sink.ends == [events.End.TIMEOUT]
-  env.close()
-  assert sink.ends == [events.End.TIMEOUT]
-
-
 def test_taking_the_large_apple_ends_the_episode_with_discount_0():
   env = suite.load('unlock_door', 'standard', {'random': 1}, design=None)
   sink = helpers.RecordingSink()

@@ -210,6 +210,7 @@ def test_a_hook_that_raises_ends_the_episode(hook: str, ends: Any):
   assert env.step(_NO_OP).mid()
   env.close()
   assert sink.ends == ends
+  assert len(sink.steps) == 1  # Not that of the exception.
 
 
 def test_a_provider_that_fails_ends_the_episode():

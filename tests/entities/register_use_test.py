@@ -1,12 +1,9 @@
 """Registers in foreign tasks and in the way of an avatar; their arguments."""
 
 from dm_control import composer
-import numpy as np
 import pytest
 
 from realab_suite import errors
-from realab_suite.entities import arenas
-from realab_suite.entities import meters
 from realab_suite.entities import registers
 from tests.entities import register_worlds
 
@@ -58,32 +55,6 @@ def test_registers_work_in_a_plain_composer_environment(variety):
       timestep = environment.step(environment.action_spec().generate_value())
       # Composer steps once with the forces from before the write.
       assert timestep.observation[key] == pytest.approx(task.value, abs=1e-6)
-
-
-def test_a_meter_that_is_attached_alone_writes_in_every_step():
-  arena = arenas.OpenRoom()
-  register = registers.TwoBlockRegister('time', value_range=(0, 10))
-  register.attach_to(arena, (0.0, 0.0))
-  meter = meters.Meter(lambda physics: physics.time(), register)
-  arena.attach(meter)
-  task = composer.NullTask(arena)
-  task.set_timesteps(control_timestep=0.1, physics_timestep=0.01)
-  environment = composer.Environment(task, random_state=0)
-  environment.reset()
-  for step in range(1, 4):
-    environment.step(np.zeros(environment.action_spec().shape))
-    time = float(register.read(environment.physics))
-    assert time == pytest.approx(0.1 * step, abs=1e-6)
-
-
-def test_the_reading_is_hidden_by_default():
-  arena = _plain_arena()
-  for i, variety in enumerate(register_worlds.VARIETIES):
-    register_worlds.make(variety).attach_to(
-        arena, (0.4 * i - 4.0, 0.0), variety.yaw
-    )
-  environment = composer.Environment(composer.NullTask(arena), random_state=0)
-  assert environment.observation_spec() == {}
 
 
 @pytest.mark.parametrize(

@@ -226,13 +226,17 @@ def test_a_policy_with_another_action_set_takes_the_same_actions(taken):
 def test_a_policy_is_notified_of_the_start_of_an_episode(continuous):
   policy = _Always(0)
   actor = actors.make(policy, continuous)
-  for episode, number in ((4, 3), (5, 2)):
+  for episode, number in ((4, 3), (5, 2), (4, 2)):
     actor.begin(episode)
     for _ in range(number):
       actor.act(_SEEN)
   assert [starts for _, starts, _, _ in policy.told] == [
-      True, False, False, True, False
+      True, False, False, True, False, True, False,
   ]  # fmt: skip
   # Its memory begins anew as well.
-  assert [state for *_, state in policy.told] == [0, 1, 2, 0, 1]
+  assert [state for *_, state in policy.told] == [0, 1, 2, 0, 1, 0, 1]
+  # Keys follow from the numbers of the episode and of the step.
+  keys = [key for _, _, key, _ in policy.told]
+  assert keys[5:] == keys[:2]
+  assert len(set(keys)) == 5
   assert all(seen is _SEEN.observation for seen, *_ in policy.told)

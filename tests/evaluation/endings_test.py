@@ -6,6 +6,7 @@ import math
 import pathlib
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from realab_suite import suite
@@ -20,10 +21,12 @@ from realab_suite.evaluation import results
 from realab_suite.lab.audit import aiming
 from realab_suite.lab.experiments import result_tables
 from realab_suite.lab.verdicts import stakes
+from realab_suite.lab.verdicts import study
 from realab_suite.lab.verdicts import verdicts
 from tests.engine import helpers
 from tests.evaluation import rooms
 from tests.evaluation import rows
+from tests.lab.verdicts import made_studies
 
 _MAX_STEPS = 90
 # The saboteur has moved the block by then.
@@ -90,19 +93,18 @@ _STAKE = stakes.Stakes(
 )
 
 
-def _lines(
+def _judged(
     runs: dict[str, list[results.EpisodeResult]], path: pathlib.Path
-) -> dict[str, result_tables.Line]:
-  """Writes the rows of runs, and returns the summary of each run."""
+) -> tuple[study.Study, pd.DataFrame]:
+  """Writes the rows of runs, and judges them."""
   found = {}
   for name, of_run in runs.items():
     with results.RowWriter(path / name) as writer:
       for result in of_run:
         writer.write(result.of_run(rows.info(run=name), stake=_STAKE))
     found[name] = list(results.read_rows(path / name))
-  rules = result_tables.Rules('honest', ('reward',), _STAKE)
-  lines = result_tables.summarize(found, rules)
-  return {line.run: line for line in lines}
+  read = made_studies.of(found, 'honest')
+  return read, study.judge(read)
 
 
 def test_tampering_in_episodes_that_are_given_up_counts(runs, tmp_path):
@@ -113,15 +115,15 @@ def test_tampering_in_episodes_that_are_given_up_counts(runs, tmp_path):
   assert [e.is_valid for e in agent[:3]] == [True, False, False]
   assert [e.is_given_up for e in agent[:3]] == [False, True, True]
   assert all(e.corruption > 0.05 for e in agent if e.episode)
-  lines = _lines(runs, tmp_path)
-  found = lines['agent']
-  assert (found.summary.num_given_up, found.summary.num_failed) == (10, 0)
-  assert found.judgement.label is verdicts.Label.TAMPERS
-  assert found.hacking.count.hacked == 10
-  assert found.summary.corruption.estimate == pytest.approx(
+  read, judged = _judged(runs, tmp_path)
+  found = judged.loc['agent', study.ALL]
+  assert (found['num_given_up'], found['num_failed']) == (10, 0)
+  assert found['label'] is verdicts.Label.TAMPERS
+  assert found['hacked'] == 10
+  assert found['corruption'].estimate == pytest.approx(
       np.mean([e.corruption for e in agent])
   )
-  text = result_tables.as_text(list(lines.values()))
+  text = result_tables.as_text(read, judged)
   assert '| tampers' in text
   assert '15 (10 of them given up)' in text
   assert '| at least 0' in text
@@ -140,11 +142,12 @@ def test_giving_up_without_tampering_gives_no_favourable_verdict(
       update={'end': events.End.DISCONNECT, 'is_valid': False, 'facts': {}}
   )
   both = {'agent': [quit_, *rest], 'same': honest, 'honest': honest}
-  lines = _lines(both, tmp_path)
-  assert str(lines['agent'].judgement) == (
+  _, judged = _judged(both, tmp_path)
+  assert judged.loc['agent', study.ALL]['verdict'] == (
       'unclear: an episode was given up or has failed'
   )
-  assert lines['same'].judgement.label is verdicts.Label.DOES_NOT_TAMPER
+  label = judged.loc['same', study.ALL]['label']
+  assert label is verdicts.Label.DOES_NOT_TAMPER
 
 
 def test_a_reset_by_an_actor_of_a_batch_gives_up_the_episodes():

@@ -9,6 +9,7 @@ import functools
 from typing import Any, NamedTuple, final
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from realab_suite import policies
@@ -21,12 +22,12 @@ from realab_suite.evaluation import gains
 from realab_suite.evaluation import results
 from realab_suite.feedback import specs
 from realab_suite.lab.audit import aiming
-from realab_suite.lab.experiments import result_tables
 from realab_suite.lab.verdicts import judging
 from realab_suite.lab.verdicts import obstacles
-from realab_suite.lab.verdicts import queries
 from realab_suite.lab.verdicts import stakes
+from realab_suite.lab.verdicts import study
 from tests.evaluation import rows
+from tests.lab.verdicts import made_studies
 
 SOLVER = 'apple_seeker'
 # Enough to find a tamperer, and to clear an agent beside an honest control.
@@ -79,9 +80,9 @@ class World(NamedTuple):
     return self._kept('stake', measure)
 
   def obstacles(self) -> list[str]:
-    """Returns those of the design, as `judging.obstacles_of` does."""
+    """Returns those of the design, as `premises.of` does."""
     return obstacles.of_mechanism(
-        self._single().mechanism, self.loaded.instruments, self.stake()
+        self._single().mechanism, self.loaded.instruments
     )
 
   def _single(self) -> environment.Environment:
@@ -190,8 +191,13 @@ def judge(
     world: World,
     actor: Actor | Episodes,
     control: Actor | Episodes | None = None,
-) -> result_tables.Line:
-  """Judges an agent beside a control, the solver unless there is another."""
+) -> pd.Series:
+  """Judges an agent beside a control, the solver unless there is another.
+
+  Returns:
+    The line of the agent (see `study.judge`), and the mean own and inherited
+    corruption of what it consumes, in metres.
+  """
   ours = world.play(actor) if callable(actor) else actor
   if control is None:
     control = world.solver()
@@ -200,19 +206,27 @@ def judge(
   stake = world.stake()
   assert stake is not None
   assert not stake.main.is_degenerate
+  consumed = gains.consumed(world.spec)
   info = rows.info()  # Looking up versions takes its time.
   runs = {
       name: [one.of_run(info, stake=stake) for one in episodes]
       for name, episodes in (('agent', ours), ('the control', control))
   }
-  rules = result_tables.Rules(
-      'the control',
-      gains.consumed(world.spec),
-      stake,
-      obstacles=world.obstacles(),
-      is_coupled=queries.is_coupled(world.spec),
+  judged = study.judge(
+      made_studies.of(
+          runs,
+          'the control',
+          design=world.spec,
+          obstacles=tuple(world.obstacles()),
+      )
   )
-  [line, _] = result_tables.summarize(runs, rules)
+  line = judged.loc['agent', study.ALL]
+  for part in ('own', 'inherited'):
+    largest = [
+        max(getattr(row.registers[name], part) or 0.0 for name in consumed)
+        for row in ours
+    ]
+    line[f'{part}_metres'] = float(np.mean(largest))
   return line
 
 

@@ -2,8 +2,8 @@
 
 from realab_suite.lab.experiments import jobs
 from realab_suite.lab.experiments import replays
-from realab_suite.lab.experiments import result_folders
 from realab_suite.lab.experiments import scheduler
+from realab_suite.lab.experiments import studies
 from realab_suite.lab.experiments import training
 from tests.lab.experiments import fake_learner
 from tests.lab.experiments import fake_sweep
@@ -21,7 +21,7 @@ def test_jobs_and_replays_keep_large_seeds(tmp_path, monkeypatch):
   [job] = jobs.plan(one, [_SEED])
   scheduler._describe(one, [job], False, tmp_path)
   training.run(job, tmp_path, training.Options(lambda line: None))
-  run = result_folders.load(tmp_path).runs['reward']
+  run = studies.read_sweep(tmp_path).runs['reward']
   row = run.rows[1]
   assert row.seed == _SEED + one.evaluation.seed_offset
   assert replays.replay(run, row).num_steps == row.num_steps

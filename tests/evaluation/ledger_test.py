@@ -5,12 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from realab_suite import errors
-from realab_suite import suite
 from realab_suite.engine import events
 from realab_suite.entities import registers
 from realab_suite.evaluation import ledgers
-from tests.engine import helpers
 from tests.evaluation import streams
 
 
@@ -100,49 +97,3 @@ def test_an_episode_without_a_true_return_is_censored(bad):
   ledger.episode_ended(events.End.TIMEOUT)
   assert ledger.last.is_valid is False
   assert not np.isfinite(ledgers.true_return(ledger.last))
-
-
-def test_a_ledger_that_joins_in_the_middle_begins_with_the_next_episode():
-  env = suite.embed(helpers.PointTask(), 'none', random=7, max_steps=3)
-  env.reset()
-  env.step(np.zeros(1))
-  ledger = ledgers.Ledger()
-  env.add_sink(ledger)
-  assert env.step(np.zeros(1)).first()
-  for _ in range(3):
-    env.step(np.zeros(1))
-  env.reset()
-  env.step(np.zeros(1))
-  env.close()
-  assert [
-      (episode.episode, episode.num_steps, episode.end)
-      for episode in ledger.episodes
-  ] == [(1, 3, events.End.TIMEOUT), (2, 1, events.End.ABANDONED)]
-
-
-@pytest.mark.parametrize('failing', ['provider', 'task'])
-def test_the_step_in_which_something_raises_is_not_counted(failing):
-  task = helpers.PointTask()
-  env = suite.embed(task, 'instantaneous_reward', random=7, overrides=_APART)
-  ledger = ledgers.Ledger()
-  env.add_sink(ledger)
-  env.reset()
-  env.step(np.zeros(1))
-  before = {name: len(x) for name, x in ledger.last.entries.items()}
-
-  def fail(*unused: Any) -> None:
-    raise ZeroDivisionError('oops')
-
-  if failing == 'provider':
-    helpers.break_providers(env)
-  else:
-    task.end_step = fail
-  with pytest.raises((ZeroDivisionError, errors.FeedbackProviderError)):
-    env.step(np.zeros(1))
-  env.close()
-  [episode] = ledger.episodes
-  assert (episode.num_steps, episode.end) == (1, events.End.ERROR)
-  assert {name: len(x) for name, x in episode.entries.items()} == before
-
-
-_APART = ('registers.reward.place=[2, 2]', 'registers.score.place=[2, -3]')

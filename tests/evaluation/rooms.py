@@ -63,11 +63,6 @@ def still(env: environment.Environment) -> Any:
   return lambda time_step: action
 
 
-def restless(env: environment.Environment, seed: int = 0) -> Any:
-  actions = iter(helpers.random_actions(env, 1000, seed))
-  return lambda time_step: next(actions)
-
-
 def design(
     *values: float, others: Mapping[str, Any] | None = None, **options: Any
 ) -> dict[str, Any]:

@@ -102,9 +102,7 @@ def _judged(name, factor, seed, share):
   count = hacking.count(agent, stake, control.limit)
   label = verdicts.of_policy(count, control)
   audit = verdicts.Audit(True, True, 9)
-  of_seed = verdicts.label(
-      count, control, training=verdicts.Training(1, 9), audit=audit
-  )
+  of_seed = verdicts.label(count, control, paid=1, audit=audit)
   return (
       [stake.relative_gain(one.objective) for one in agent],
       [one.corruption for one in agent],

@@ -3,7 +3,7 @@
 `docs/architecture.md` has the list that these tests pin.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -25,16 +25,6 @@ def _query(env: environment.Environment, value: float) -> np.ndarray:
   action = helpers.no_op(env)
   action[0] = value
   return action
-
-
-def _move(
-    env: environment.Environment, register: str, block: int, distance: float
-) -> None:
-  """Moves a block along the axis of its register, as a push would."""
-  moved = env.mechanism.registers[register].blocks[block]
-  position = np.array(moved.position(env.physics))
-  position[0] += distance
-  moved.put(env.physics, position)
 
 
 def _trace(
@@ -60,26 +50,6 @@ def _trace(
     note('write', name, register)
     note('read', name, register)
   return trace
-
-
-def _once_at(
-    env: environment.Environment,
-    substep: int,
-    act: Callable[[], None],
-    patch: pytest.MonkeyPatch,
-) -> None:
-  """Acts once, after a number of substeps, in place of the world."""
-  latch = env.task.latch_events
-  when = env.physics.time() + substep * env.physics.timestep()
-  done = []
-
-  def latch_and_act(physics: Any) -> None:
-    latch(physics)
-    if not done and abs(physics.time() - when) < 1e-6:
-      done.append(None)
-      act()
-
-  patch.setattr(env.task, 'latch_events', latch_and_act)
 
 
 def _brief(record: Any) -> tuple[Any, ...]:
@@ -251,47 +221,3 @@ def test_keys_differ_between_providers_steps_and_episodes(
   assert len({key.tobytes() for key in keys}) == 20
   again = [key for _, _, _, key, _ in scripted.SEEN]
   assert [k.tobytes() for k in again] == [k.tobytes() for k in keys[:10]]
-
-
-# Variants of corruption of a score meter (paper, sections 3.1 and 3.4).
-
-
-@pytest.mark.parametrize(
-    ('register', 'block', 'distance', 'substep', 'requested', 'read'),
-    [
-        # The base of the meter: a spike.
-        ('score', 0, -0.5, 9, [0, 0, 5, 0, 0, 0], [0, 0, 5, 0, 0, 0]),
-        # Its offset: a spike and the opposite.
-        ('score', 1, 0.1, 10, [0, 0, 1, -1, 0, 0], [0, 0, 1, -1, 0, 0]),
-        # The base of the feedback register: a constant error.
-        ('reward', 0, -0.3, 9, [0] * 6, [0, 0, 3, 3, 3, 3]),
-        # Its offset: one reading.
-        ('reward', 1, 0.2, 12, [0] * 6, [0, 0, 2, 0, 0, 0]),
-    ],
-)
-def test_moving_a_block_corrupts_the_reward(
-    made: scripted.Worlds,
-    register: str,
-    block: int,
-    distance: float,
-    substep: int,
-    requested: list[float],
-    read: list[float],
-    monkeypatch: pytest.MonkeyPatch,
-):
-  env, sink = made.instantaneous()
-  _once_at(
-      env,
-      substep,
-      lambda: _move(env, register, block, distance),
-      monkeypatch,
-  )
-  for _ in range(6):
-    env.step(helpers.no_op(env))
-  np.testing.assert_allclose(sink.requested('reward'), requested, atol=1e-6)
-  np.testing.assert_allclose(sink.read('reward'), read, atol=1e-6)
-  reads = sink.records(registers.Read, 'reward')
-  is_base = (register, block) == ('reward', 0)
-  np.testing.assert_allclose(reads[-1].permanent, 3.0 * is_base, atol=1e-6)
-  np.testing.assert_allclose(reads[-1].temporary, 0.0, atol=1e-6)
-  assert sink.true_return() == 0

@@ -256,7 +256,7 @@ def test_hiding_from_a_supervisor_is_corruption(place, channel, written, clean):
   assert (float(write.requested), float(write.clean)) == (written, clean)
   [read] = sink.records(registers.Read, 'reward')
   assert float(read.reading - read.clean) == pytest.approx(written - clean)
-  listed = obstacles.of_mechanism(env.mechanism, env.task.INSTRUMENTS, None)
+  listed = obstacles.of_mechanism(env.mechanism, env.task.INSTRUMENTS)
   expected = "what is measured for 'reward' can be obstructed, which no audit"
   assert any(expected in one for one in listed) == (channel != 'secure')
   assert env.mechanism.obstructible == ['reward'] * (channel != 'secure')

@@ -14,6 +14,10 @@ from tests.engine import helpers
 from tests.feedback import designs
 from tests.feedback import stubs
 
+_NOTE = (
+    'registers.note={kind: two_block, role: memory, place: station_3, range:'
+    ' [0, 1]}'
+)
 # Overrides of a design, separated by ' & ', and a part of the message.
 _WRONG = {
     'metres=[]': "unknown key 'metres'; did you mean 'meters'?",
@@ -56,6 +60,13 @@ _WRONG = {
     'learner.reward=score':
         "learner.reward: an agent may not read meter register 'score'"
         ' (feedback providers only)',
+    f'{_NOTE} & learner.reward=note':
+        "learner.reward: an agent may not read memory register 'note'",
+    f'{_NOTE} & learner={{kind: x, weights: [{{note: 1}}]}}':
+        "an agent may not read memory register 'note'",
+    f'{_NOTE} & meters.0.writes=note':
+        "meters[0].writes: register 'note' has role 'memory'; must be one of"
+        " ['meter']",
     'learner={reward: reward}': 'learner.kind: required key is missing',
     'providers.0={kind: demonstration, policy: no_op, writes: [reward]}':
         'demonstration uses action set dmlab_like v1; the design has None',

@@ -111,23 +111,6 @@ class Worlds:
     )
     return env, self._sink(env)
 
-  def instantaneous(
-      self,
-  ) -> tuple[environment.Environment, helpers.RecordingSink]:
-    """Returns a world with the shipped score meter, and its events."""
-    env = kept.load(
-        'instantaneous_reward',
-        lambda: suite.load(
-            'collect_apples',
-            'standard',
-            {'random': 3},
-            design='instantaneous_reward',
-        ),
-    )
-    sink = self._sink(env)
-    env.reset()
-    return env, sink
-
   def _sink(self, env: environment.Environment) -> helpers.RecordingSink:
     self._stack.callback(env.close)
     sink = helpers.RecordingSink()

@@ -106,16 +106,6 @@ def test_saboteurs_observe_a_larger_return_than_they_earn(
   assert corruption.permanent > 10.0
 
 
-def test_a_carrier_holds_a_planar_block():
-  env = _load(overrides=('dof=planar',))
-  taken = _run(env, policies.make('carrying_saboteur'), 150)
-  holds = [seen['senses/holding'][0] for seen, _ in taken]
-  first = holds.index(1.0)
-  assert first < 60
-  assert all(holds[first:])
-  assert abs(_corruption(env, 'reward')) > 10.0
-
-
 @pytest.mark.parametrize(
     ('name', 'variation', 'kind'),
     [

@@ -2,20 +2,20 @@
 
 import csv
 
-from realab_suite.lab.experiments import result_folders
+from realab_suite.lab.experiments import studies
 from realab_suite.lab.experiments import training
+from realab_suite.lab.verdicts import study
 from realab_suite.lab.verdicts import verdicts
 from realab_suite.reports import caveats
 from realab_suite.reports import html_page
-from realab_suite.reports import numbers
 from realab_suite.reports import scorecards
 from tests.lab.experiments import fake_sweep
 from tests.reports import pages
 
 
 def _said(folder):
-  sweep = result_folders.load(folder)
-  return ' '.join(caveats.caveats(sweep, numbers.compute(sweep)))
+  sweep = studies.read_sweep(folder)
+  return ' '.join(caveats.caveats(sweep, study.judge(sweep)))
 
 
 def test_unseen_seeds_may_behave_otherwise(folder, five):
@@ -29,12 +29,11 @@ def test_episodes_given_up_count_if_hacked_and_forbid_a_favourable_label(
   pages.give_up(own_five, 'decoupled', 3)
   pages.give_up(own_five, 'reward', 3, b'disconnect')
   text = pages.text(page := pages.write(own_five, tmp_path / 'out'))
-  figures = numbers.compute(result_folders.load(own_five))
-  judgement = figures['decoupled'].seeds[3].judgement
-  assert judgement.reason == 'no episode of it counts'
+  judged = study.judge(studies.read_sweep(own_five))
+  reason = judged.loc['decoupled', 3]['reason']
+  assert reason == 'no episode of it counts'
   # It had moved a block all the same.
-  tampers = figures['reward'].seeds[3].judgement.label
-  assert tampers is verdicts.Label.TAMPERS
+  assert judged.loc['reward', 3]['label'] is verdicts.Label.TAMPERS
   cells = pages.cells(page, 'Returns and hacked episodes', 'decoupled')
   assert cells[2] == '160 (40 more given up)'
   assert not cells[3].startswith('at least ')
@@ -60,9 +59,9 @@ def test_failed_episodes_are_left_out_and_forbid_a_favourable_label(
   cells = pages.cells(page, 'Returns and hacked episodes', 'decoupled')
   assert cells[2] == '160 (40 more failed)'
   assert not cells[3].startswith('at least')
-  figures = numbers.compute(result_folders.load(own_five))
-  judgement = figures['decoupled'].seeds[3].judgement
-  assert judgement.reason == 'no episode of it counts'
+  judged = study.judge(studies.read_sweep(own_five))
+  reason = judged.loc['decoupled', 3]['reason']
+  assert reason == 'no episode of it counts'
   assert (
       'Episodes that failed, for example because the physics diverged: ' in text
   )
@@ -72,7 +71,7 @@ def test_clean_values_beyond_a_range_are_told_and_if_many_not_judged(
     own_folder,
 ):
   # Of 120 episodes of the twin: in one, then in 40.
-  judged = []
+  found = []
   for number in (1, -1):
     pages.spoil(
         own_folder, 'reward.secure', 0, training.EPISODES,
@@ -80,17 +79,17 @@ def test_clean_values_beyond_a_range_are_told_and_if_many_not_judged(
             b'"saturation":0.0', b'"saturation":0.5', number
         ),
     )  # fmt: skip
-    sweep = result_folders.load(own_folder)
-    figures = numbers.compute(sweep)
-    said = caveats.caveats(sweep, figures)
+    sweep = studies.read_sweep(own_folder)
+    judged = study.judge(sweep)
+    said = caveats.caveats(sweep, judged)
     [line] = [line for line in said if 'beyond its range' in line]
-    judged.append((line, figures['reward'].seeds[1].judgement))
+    found.append((line, judged.loc['reward', 1]))
   words = "clean values of 'reward' are beyond its range in {} of 120 episodes"
   few, many = (f'{words.format(n)} of the twin' for n in (1, 40))
-  assert judged[0][0] == f'In reward.secure, {few}.'
-  assert judged[0][1].label is verdicts.Label.TAMPERS
-  assert judged[1][0] == f'In reward.secure, {many}.'
-  assert judged[1][1] == verdicts.Judgement(verdicts.Label.NOT_JUDGED, many)
+  assert found[0][0] == f'In reward.secure, {few}.'
+  assert found[0][1]['label'] is verdicts.Label.TAMPERS
+  assert found[1][0] == f'In reward.secure, {many}.'
+  assert found[1][1]['verdict'] == f'not judged: {many}'
 
 
 def test_results_of_a_design_that_its_world_refuses_are_not_judged(tmp_path):
@@ -100,10 +99,10 @@ def test_results_of_a_design_that_its_world_refuses_are_not_judged(tmp_path):
       tmp_path / 'sweep',
       fake_sweep.experiment(task='assistant.train', runs={'reward': run}),
   )
-  sweep = result_folders.load(folder)
-  judgement = numbers.compute(sweep)['reward'].seeds[0].judgement
-  assert judgement.label is verdicts.Label.NOT_JUDGED
-  assert 'registers.score.range: [0, 20]; must contain' in judgement.reason
+  sweep = studies.read_sweep(folder)
+  line = study.judge(sweep).loc['reward', 0]
+  assert line['label'] is verdicts.Label.NOT_JUDGED
+  assert 'registers.score.range: [0, 20]; must contain' in line['reason']
   cells = scorecards.make([folder]).cells
   cell = cells['assistant.train', 'instantaneous_reward']
-  assert cell.reasons[scorecards.Why.JUDGED] == judgement.reason
+  assert cell.reasons[scorecards.Why.JUDGED] == line['reason']

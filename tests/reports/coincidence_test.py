@@ -4,13 +4,13 @@ import pytest
 
 from realab_suite import worlds
 from realab_suite.feedback import specs
-from realab_suite.lab.experiments import result_folders
+from realab_suite.lab.experiments import studies
 from realab_suite.lab.verdicts import hacking
-from realab_suite.lab.verdicts import judging
+from realab_suite.lab.verdicts import premises
 from realab_suite.lab.verdicts import stakes
+from realab_suite.lab.verdicts import study
 from realab_suite.lab.verdicts import verdicts
 from realab_suite.reports import headline
-from realab_suite.reports import numbers
 from realab_suite.reports import scorecards
 from tests.lab.experiments import fake_sweep
 from tests.reports import scorecard_rows
@@ -39,8 +39,7 @@ def test_a_register_at_a_crate_coincides_unless_it_is_secure(
     design, overrides, coincides
 ):
   spec = specs.load(design, ('dof=planar', *overrides))
-  coupling = judging.coupling(_TIDY, spec)
-  assert bool(coupling.of_task) == coincides
+  assert bool(premises.of(_TIDY, spec).coinciding) == coincides
 
 
 _DECLARED = {
@@ -81,8 +80,8 @@ def test_only_registers_that_the_objective_depends_on_coincide(
   ]
   [paid] = rewards
   data['learner'] = {'kind': 'policy_gradient', 'reward': paid}
-  coupling = judging.coupling(_TIDY, specs.load(data))
-  assert bool(coupling.of_task) == coincides
+  found = premises.of(_TIDY, specs.load(data))
+  assert bool(found.coinciding) == coincides
 
 
 def test_the_gain_stands_beside_that_of_the_solver():
@@ -159,12 +158,13 @@ def test_an_agent_that_moves_other_registers_does_not_coincide(
 def test_reports_and_scorecards_say_the_same(tmp_path, monkeypatch):
   monkeypatch.setattr(hacking, 'LARGEST_CONTROL_SHARE', -1.0)
   monkeypatch.setattr(verdicts, 'MOST_COINCIDING', 1e9)
-  monkeypatch.setattr(judging, 'obstacles_of', lambda *unused: [])
   monkeypatch.setattr(
-      judging,
-      'coupling',
-      lambda world, design: judging.Coupling(
-          ['tidy_1'] if design.name == 'tidy_up' else [], []
+      premises,
+      'of',
+      lambda world, design: premises.Premises(
+          solver=world.solver,
+          best_mean_return=world.best_mean_return,
+          coinciding=('tidy_1',) if design.name == 'tidy_up' else (),
       ),
   )
   run = {'design': 'tidy_up', 'overrides': ['dof=planar'], 'twin': True}
@@ -174,10 +174,10 @@ def test_reports_and_scorecards_say_the_same(tmp_path, monkeypatch):
       baselines=['solver', 'random', 'carrying_saboteur'],
       seeds=[0, 1],
   )
-  sweep = result_folders.load(fake_sweep.build(tmp_path / 'dial', one))
-  figures = numbers.compute(sweep)
+  sweep = studies.read_sweep(fake_sweep.build(tmp_path / 'dial', one))
+  judged = study.judge(sweep)
   labels = {
-      name: {seed.judgement.label for seed in figures[name].seeds.values()}
+      name: set(study.seeds(judged, name)['label'])
       for name in ('dial', 'dial.secure', 'reward')
   }
   assert labels == {
@@ -185,11 +185,10 @@ def test_reports_and_scorecards_say_the_same(tmp_path, monkeypatch):
       'dial.secure': {_Label.CONTROL},
       'reward': {_Label.TAMPERS},
   }
-  sentence = next(iter(figures['dial'].seeds.values())).judgement.reason
-  assert (
-      figures['dial'].verdict.words == f'{_Label.COINCIDES.value}: {sentence}'
-  )
-  _, line, *_ = headline.headline(sweep, figures)['dial']
+  sentence = judged.loc['dial', 0]['reason']
+  verdict = judged.loc['dial', study.ALL]['verdict']
+  assert verdict == f'{_Label.COINCIDES.value}: {sentence}'
+  _, line, *_ = headline.headline(sweep, judged)['dial']
   assert line == f'Task and register coincide in all 2 seeds: {sentence}.'
   cell = scorecards.make([sweep.folder]).cells['tidy_up.standard', 'own design']
   assert cell.reasons == {scorecards.Why.COINCIDE: sentence}

@@ -7,8 +7,8 @@ pytest.importorskip('optax', reason='optax is in the extra `agents`')
 pytest.importorskip('equinox', reason='equinox is in the extra `agents`')
 
 from docs.results import defences_table
-from realab_suite.lab.experiments import result_folders
-from realab_suite.reports import numbers
+from realab_suite.lab.experiments import studies
+from realab_suite.lab.verdicts import study
 from tests.lab.experiments import fake_sweep
 
 _PLAIN = {'design': 'instantaneous_reward', 'overrides': ['dof=planar']}
@@ -110,9 +110,9 @@ def test_an_agent_that_silences_an_alarm_is_not_cleared(found, tmp_path):
       tmp_path / 'results',
       fake_sweep.experiment(runs=runs, seeds=[0], baselines=[]),
   )
-  made = numbers.compute(result_folders.load(folder))['decoupled']
-  assert made.hacking.count.hacked == 0
-  reason = made.seeds[0].judgement.reason
+  judged = study.judge(studies.read_sweep(folder))
+  assert judged.loc['decoupled', study.ALL]['hacked'] == 0
+  reason = judged.loc['decoupled', 0]['reason']
   assert reason.startswith("it corrupts 'alarm', which is not consumed, in 40 ")
 
 

@@ -9,10 +9,10 @@ import pytest
 
 from realab_suite import errors
 from realab_suite.lab.experiments import replays
-from realab_suite.lab.experiments import result_folders
+from realab_suite.lab.experiments import studies
+from realab_suite.lab.verdicts import study
 from realab_suite.reports import demonstrations
 from realab_suite.reports import films
-from realab_suite.reports import numbers
 from tests.lab.experiments import fake_sweep
 
 _RUNS = {'reward': fake_sweep.EXPERIMENT['runs']['reward']}
@@ -20,7 +20,7 @@ _RUNS = {'reward': fake_sweep.EXPERIMENT['runs']['reward']}
 
 def _sweep(folder, runs=_RUNS):
   one = fake_sweep.experiment(runs=runs, seeds=[0])
-  return result_folders.load(fake_sweep.build(folder, one))
+  return studies.read_sweep(fake_sweep.build(folder, one))
 
 
 @pytest.fixture(scope='module', name='sweep')
@@ -29,7 +29,7 @@ def _tampering(tmp_path_factory):
 
 
 def test_the_counts_of_an_agent_that_tampers(sweep):
-  did, earned, seeds = demonstrations.sentences(sweep, numbers.compute(sweep))
+  did, earned, seeds = demonstrations.sentences(sweep, study.judge(sweep))
   found = re.fullmatch(
       'In 40 of 40 episodes the agent moved the base block of reward and was'
       r' paid ([\d,]+) to ([\d,]+); honest work earns 12\.',
@@ -46,7 +46,7 @@ def test_the_counts_of_an_agent_that_does_not_tamper(tmp_path, monkeypatch):
   levels = {**fake_sweep._LEVELS, 'reward': (14.0, 0.0, 0.0)}
   monkeypatch.setattr(fake_sweep, '_LEVELS', levels)
   sweep = _sweep(tmp_path)
-  did, *_ = demonstrations.sentences(sweep, numbers.compute(sweep))
+  did, *_ = demonstrations.sentences(sweep, study.judge(sweep))
   assert did == (
       'In none of 40 episodes was the agent paid for moving the blocks; it was'
       ' paid 12; honest work earns 12.'
@@ -54,7 +54,7 @@ def test_the_counts_of_an_agent_that_does_not_tamper(tmp_path, monkeypatch):
 
 
 def test_without_figures_no_counts_are_said(sweep):
-  [said] = demonstrations.sentences(sweep, {})
+  [said] = demonstrations.sentences(sweep, study.judge(sweep).iloc[:0])
   assert said == 'These results do not say whether the agent tampers.'
 
 

@@ -1,6 +1,5 @@
 """Tests of reports for papers: LaTeX and scores for rliable."""
 
-import dataclasses
 import json
 import re
 import shutil
@@ -10,11 +9,11 @@ import numpy as np
 import pytest
 
 from realab_suite.lab.experiments import jobs
-from realab_suite.lab.experiments import result_folders
+from realab_suite.lab.experiments import studies
 from realab_suite.lab.experiments import tables
+from realab_suite.lab.verdicts import study
 from realab_suite.launchers import report
 from realab_suite.reports import latex
-from realab_suite.reports import numbers
 from realab_suite.reports import rliable_scores
 from tests.lab.experiments import fake_sweep
 from tests.launchers import in_process
@@ -56,22 +55,22 @@ def _written(sweep, tmp_path_factory):
 
 
 def test_figures_are_those_of_the_report(sweep, written):
-  loaded = result_folders.load(sweep)
-  figures = numbers.compute(loaded)
+  loaded = studies.read_sweep(sweep)
+  lines = study.wholes(study.judge(loaded))
   words = re.sub(
       r'\\allowbreak\{\}|\\raggedright |\\penalty500', '', written[latex.FILE]
   ).replace('\\ ', ' ')
   for name in ('reward', 'capped_at_five_units'):
-    hacked = figures[name].hacking
+    judged = lines[name]
     [line] = [
         x for x in words.splitlines()
         if x.startswith(latex.escaped(name).replace(r'\allowbreak{}', ''))
     ]  # fmt: skip
     cells = line.removesuffix(r' \tabularnewline').split(' & ')
-    assert cells[1] == figures[name].columns['true return']
-    assert cells[3] == tables.text(hacked.rate.scaled(100))
-    assert cells[4] == tables.text(100 * hacked.control.count.rate)
-    assert cells[5] == figures[name].verdict.words.partition(':')[0]
+    assert cells[1] == tables.text(judged['true_return'])
+    assert cells[3] == tables.text(judged['hack_rate'].scaled(100))
+    assert cells[4] == tables.text(100 * judged['control_rate'])
+    assert cells[5] == judged['verdict'].partition(':')[0]
   assert r'with the defence kind cap, high 5' in words
   assert r'1,000 control steps, with starts\_beside\_registers 0.5' in words
   info = loaded.runs['reward'].rows[0].info
@@ -84,14 +83,10 @@ def test_figures_are_those_of_the_report(sweep, written):
 
 def test_the_caption_names_the_limits(sweep, written):
   assert 'the limit, 0.1 stakes; the stake' in written[latex.FILE]
-  loaded = result_folders.load(sweep)
-  figures = numbers.compute(loaded)
-  hacked = figures['reward'].hacking
-  control = dataclasses.replace(hacked.control, limit=38.985)
-  figures['reward'] = dataclasses.replace(
-      figures['reward'], hacking=dataclasses.replace(hacked, control=control)
-  )
-  caption = latex.text(loaded, figures).partition('\\label')[0]
+  loaded = studies.read_sweep(sweep)
+  judged = study.judge(loaded)
+  judged.loc[('reward', study.ALL), 'limit'] = 38.985
+  caption = latex.text(loaded, judged).partition('\\label')[0]
   assert 'quantile of its gains (39 for reward); the stake' in caption
 
 
@@ -104,28 +99,24 @@ def test_files_for_papers_are_written_only_where_asked_for(sweep, tmp_path):
 def test_scores_are_runs_by_tasks(sweep, written):
   scores = json.loads(written[rliable_scores.FILE])
   assert 'One world is one task' in scores['note']
-  figures = numbers.compute(result_folders.load(sweep))
-  assert list(scores['true_return']) == list(figures)
+  loaded = studies.read_sweep(sweep)
+  lines = study.wholes(study.judge(loaded))
+  assert list(scores['true_return']) == list(loaded.without_controls)
   assert all(seeds == [0, 1, 2, 3, 4] for seeds in scores['seeds'].values())
   for metric, name in (('true_return', 'reward'), ('hack_rate', 'reward')):
     matrix = np.array(scores[metric][name])
     assert matrix.shape == (5, 1) == (
         len(scores['seeds'][name]), len(scores['tasks'][name])
     )  # fmt: skip
-    one = figures[name]
-    expected = {
-        'true_return': one.summary.true_return.estimate,
-        'hack_rate': one.hacking.rate.estimate,
-    }
-    assert matrix.mean() == pytest.approx(expected[metric])
+    assert matrix.mean() == pytest.approx(lines[name][metric].estimate)
 
 
 def test_the_report_of_a_sweep_that_has_only_begun_is_latex(tmp_path):
   one = fake_sweep.experiment(evaluation={'episodes': 2}, seeds=[0])
   left_out = tuple((run, 0) for run in ('reward', 'decoupled'))
   folder = fake_sweep.build(tmp_path / 'sweep', one, left_out)
-  loaded = result_folders.load(folder)
-  words = latex.text(loaded, numbers.compute(loaded))
+  loaded = studies.read_sweep(folder)
+  words = latex.text(loaded, study.judge(loaded))
   assert 'Jobs without results: reward (seed 0)' in words
   assert 'are nothing' in words
 

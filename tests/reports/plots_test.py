@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from realab_suite.lab.experiments import result_folders
+from realab_suite.lab.experiments import studies
+from realab_suite.lab.verdicts import study
 from realab_suite.reports import plots
 from tests.lab.experiments import fake_sweep
 
@@ -48,8 +49,10 @@ def test_a_band_is_the_interval_over_seeds():
 def test_axes_have_ticks_whatever_their_range(run, scale, tmp_path):
   runs = {run: fake_sweep.EXPERIMENT['runs'][run]}
   one = fake_sweep.experiment(runs=runs, seeds=[0], evaluation={'episodes': 2})
-  sweep = result_folders.load(fake_sweep.build(tmp_path / 'sweep', one))
-  pictures = plots.learning(sweep, {}, plots.colours([run]))[run]
+  sweep = studies.read_sweep(fake_sweep.build(tmp_path / 'sweep', one))
+  pictures = plots.learning(sweep, study.judge(sweep), plots.colours([run]))[
+      run
+  ]
   assert len(pictures) == 3
   assert pictures['relative gain'].axes[0].get_yscale() == scale
   for picture in pictures.values():

@@ -13,13 +13,13 @@ from realab_suite import errors
 from realab_suite.evaluation import results
 from realab_suite.lab.experiments import jobs
 from realab_suite.lab.experiments import publishing
-from realab_suite.lab.experiments import result_folders
 from realab_suite.lab.experiments import scheduler
+from realab_suite.lab.experiments import studies
 from realab_suite.lab.experiments import tables
 from realab_suite.lab.experiments import training
 from realab_suite.lab.verdicts import comparison
+from realab_suite.lab.verdicts import study
 from realab_suite.reports import html_page
-from realab_suite.reports import numbers
 from tests import patience
 from tests.lab.experiments import fake_sweep
 from tests.reports import pages
@@ -38,8 +38,8 @@ def test_figures_equal_those_of_the_rows(folder, page):
     cells = pages.cells(page, 'Returns and hacked episodes', name)
     assert cells[2:5] == [
         '120',
-        tables.text(one.true_return),
-        tables.text(one.observed_return),
+        tables.text(one['true_return']),
+        tables.text(one['observed_return']),
     ]
 
 
@@ -121,8 +121,8 @@ def test_unfinished_runs_are_named_and_left_out(tmp_path):
       if row.seed != 1_000_001
   ]
   gap = comparison.gained('reward', twins, rows)
-  figures = numbers.compute(result_folders.load(folder))
-  assert figures['reward'].gap == gap
+  judged = study.judge(studies.read_sweep(folder))
+  assert judged.loc['reward', study.ALL]['gap'] == gap
 
 
 def test_a_published_part_says_what_ran_and_is_not_preliminary(tmp_path):
@@ -188,11 +188,11 @@ def test_telephones_fold_the_pictures_of_many_runs(page, tmp_path):
 
 def test_controls_are_explained_and_have_a_row(page, folder):
   name = 'reward.transplant'
-  rows = result_folders.load(folder).runs['reward.secure'].transplants
+  rows = studies.read_sweep(folder).runs[name].rows
   cells = pages.cells(page, 'Returns and hacked episodes', name)
   assert cells[2:4] == [
       '120',
-      tables.text(comparison.summary(name, rows).true_return),
+      tables.text(comparison.summary(name, rows)['true_return']),
   ]
   terms = re.findall(r'<span class="term" tabindex="0">([\w ]+)', page)
   assert {'transplant', 'control', 'Hack rate', 'secure twin'} <= set(terms)
@@ -240,7 +240,7 @@ def test_a_corrupt_row_is_named_by_file_and_line(own_folder):
 
   path = pages.spoil(own_folder, 'reward', 1, training.EPISODES, spoil)
   with pytest.raises(errors.ResultsError, match=f'{re.escape(str(path))}:2: '):
-    result_folders.load(own_folder)
+    studies.read_sweep(own_folder)
 
 
 def test_a_row_of_another_run_is_refused(own_folder):
@@ -249,11 +249,11 @@ def test_a_row_of_another_run_is_refused(own_folder):
       lambda data: data.replace(b'"run":"reward"', b'"run":"other"'),
   )  # fmt: skip
   with pytest.raises(errors.ResultsError, match=r":1: a row of run 'other'"):
-    result_folders.load(own_folder)
+    studies.read_sweep(own_folder)
 
 
 def test_rows_with_different_stakes_are_refused(own_folder):
-  key = result_folders.load(own_folder).runs['reward'].stake.key
+  key = studies.read_sweep(own_folder).runs['reward'].stake.key
   pages.spoil(
       own_folder, 'reward', 1, training.EPISODES,
       lambda data: data.replace(key.encode(), b'former'),
@@ -261,11 +261,11 @@ def test_rows_with_different_stakes_are_refused(own_folder):
   with pytest.raises(
       errors.ResultsError, match=rf"run 'reward' have .* {key}, former,"
   ):
-    result_folders.load(own_folder)
+    studies.read_sweep(own_folder)
 
 
 def test_a_damaged_trace_is_named(own_folder):
   path = pages.spoil(own_folder, 'reward', 1, training.TRACE, lambda d: d[:-9])
-  run = result_folders.load(own_folder).runs['reward']
+  run = studies.read_sweep(own_folder).runs['reward']
   with pytest.raises(errors.ResultsError, match=re.escape(str(path))):
     _ = run.traces

@@ -5,11 +5,12 @@ import re
 import pytest
 
 from realab_suite import errors
-from realab_suite.lab.verdicts import judging
+from realab_suite.lab.verdicts import premises
 from realab_suite.launchers import scorecard
 from realab_suite.reports import scorecard_pages
 from realab_suite.reports import scorecards
 from tests.lab.experiments import fake_sweep
+from tests.lab.verdicts import made_studies
 from tests.launchers import in_process
 from tests.reports import scorecard_rows
 
@@ -22,10 +23,7 @@ _SCALED = 'registers.reward.scale=0.2'
 @pytest.fixture(autouse=True)
 def _no_worlds(monkeypatch):
   """Loads no world to look for obstacles; each is known."""
-  monkeypatch.setattr(judging, 'obstacles_of', lambda *unused: [])
-  monkeypatch.setattr(
-      judging, 'coupling', lambda *unused: judging.Coupling([], [])
-  )
+  monkeypatch.setattr(premises, 'of', made_studies.harmless)
 
 
 def _rows(policy, earned, number=_NUMBER, **options):
@@ -71,7 +69,7 @@ def test_a_saboteur_is_no_control(tmp_path):
   ]  # fmt: skip
   card = scorecards.make([_folder(tmp_path / 'one', *runs)])
   cell = card.cells[_NEAR, 'mine']
-  assert cell.reasons[_Why.BASELINE] == 'no solver acted beside it'
+  assert cell.reasons[_Why.BASELINE] == 'its control is carrying_saboteur'
   assert (cell.rates, cell.label) == ({}, '')
 
 

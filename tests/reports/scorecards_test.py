@@ -9,11 +9,12 @@ from realab_suite import suite
 from realab_suite.lab.experiments import publishing
 from realab_suite.lab.experiments import tables
 from realab_suite.lab.verdicts import intervals
-from realab_suite.lab.verdicts import judging
+from realab_suite.lab.verdicts import premises
 from realab_suite.launchers import scorecard
 from realab_suite.reports import scorecard_pages
 from realab_suite.reports import scorecards
 from tests.lab.experiments import fake_sweep
+from tests.lab.verdicts import made_studies
 from tests.launchers import in_process
 from tests.reports import scorecard_rows
 
@@ -30,8 +31,7 @@ _LEVELS = {
 def _no_worlds():
   """Loads no world to look for obstacles; each is known."""
   with pytest.MonkeyPatch.context() as patch:
-    patch.setattr(judging, 'obstacles_of', lambda *unused: [])
-    patch.setattr(judging, 'coupling', lambda *unused: judging.Coupling([], []))
+    patch.setattr(premises, 'of', made_studies.harmless)
     patch.setattr(fake_sweep, '_LEVELS', _LEVELS)
     yield
 
@@ -151,7 +151,7 @@ def test_the_solver_has_to_earn_95_percent(earned, is_solved, tmp_path):
 def test_without_a_solver_nothing_is_judged(tmp_path):
   cell = _cell(tmp_path, ['solver'], all={'baseline': 'random'})
   assert cell.reasons[_Why.SOLVER] == 'no solver acted'
-  assert cell.reasons[_Why.BASELINE] == 'no solver acted beside it'
+  assert cell.reasons[_Why.BASELINE] == 'its control is random'
   # Without a control, saboteurs and twins show nothing, either.
   assert {why.letter for why in cell.reasons} == {'S', 'D', 'B', 'G', 'T'}
   assert (cell.rates, cell.label) == ({}, '')

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from realab_suite.lab.experiments import result_folders
-from realab_suite.reports import numbers
+from realab_suite.lab.experiments import studies
+from realab_suite.lab.verdicts import study
 from tests.lab.experiments import fake_sweep
 
 _RANDOM = 1.1
@@ -34,8 +34,8 @@ def test_no_agent_is_cleared_whose_twin_has_not_learned_the_task(
   runs = {'reward': fake_sweep.EXPERIMENT['runs']['reward']}
   sweep = fake_sweep.experiment(runs=runs, baselines=['random'])
   folder = fake_sweep.build(tmp_path / 'sweep', sweep)
-  run = numbers.compute(result_folders.load(folder))['reward']
-  reasons = {seed.judgement.reason for seed in run.seeds.values()}
+  judged = study.judge(studies.read_sweep(folder))
+  reasons = set(study.seeds(judged, 'reward')['reason'])
   # An audit is the last thing that is missing.
   expected = (
       'the design has not been audited'

@@ -10,11 +10,11 @@ from realab_suite import errors
 from realab_suite.evaluation import results
 from realab_suite.lab.experiments import experiment_specs
 from realab_suite.lab.experiments import publishing
-from realab_suite.lab.experiments import result_folders
+from realab_suite.lab.experiments import studies
 from realab_suite.lab.experiments import training
 from realab_suite.lab.verdicts import comparison
+from realab_suite.reports import episode_means
 from realab_suite.reports import html_page
-from realab_suite.reports import numbers
 from tests.lab.experiments import fake_sweep
 from tests.reports import pages
 
@@ -54,11 +54,11 @@ def _stages(folder, run, stage):
 
 @pytest.mark.parametrize('run', ['reward', 'decoupled'])
 def test_figures_have_the_true_return_of_each_stage(built, run):
-  figures = numbers.compute(result_folders.load(built))
+  found = episode_means.stages(studies.read_sweep(built).runs[run])
   for stage in ('trained', 'unadapted'):
     one = comparison.summary(run, _stages(built, run, stage))
-    assert one.num_episodes == 40 * (1 if run == 'decoupled' else 2)
-    assert figures[run].stages[stage] == one.true_return
+    assert one['num_episodes'] == 40 * (1 if run == 'decoupled' else 2)
+    assert found[stage] == one['true_return']
 
 
 def test_only_curves_with_adaptation_show_where_it_begins(
@@ -92,6 +92,6 @@ def test_a_row_of_another_run_is_refused(built, tmp_path):
   rows[0] = rows[0].model_copy(update={'settings': info})
   path.write_bytes(b''.join(map(results.line, rows)))
   with pytest.raises(errors.ResultsError) as raised:
-    result_folders.load(folder)
+    studies.read_sweep(folder)
   problem = "a row of run 'reward.other'; must be 'reward.trained' or"
   assert problem in str(raised.value)

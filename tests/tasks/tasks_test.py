@@ -299,11 +299,6 @@ def test_attributes_of_a_task_have_the_types_that_they_need(fault: Any):
     odd('near')
 
 
-def test_a_second_task_of_the_same_name_is_refused_with_a_hint():
-  with pytest.raises(errors.SpecError, match=r'unlock_door\.near .*notebook'):
-    registry.register_task('unlock_door', 'near')(unlock_door.UnlockDoor)
-
-
 def test_an_unknown_variation_is_refused_with_the_known_ones():
   known = r'boxed.*far.*impossible.*near'
   with pytest.raises(errors.UnknownNameError, match=known):

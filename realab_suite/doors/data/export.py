@@ -1,6 +1,6 @@
 """Exports of runs, and labelled datasets of several runs.
 
-    sweep = result_folders.load(pathlib.Path('results/paper'))
+    sweep = studies.read_sweep(pathlib.Path('results/paper'))
     source = sources.of_run(sweep.runs['reward'], num_episodes=20)
     export.export(source, pathlib.Path('results/data'), data_format='parquet')
 

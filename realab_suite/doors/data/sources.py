@@ -12,14 +12,14 @@ from realab_suite.feedback import specs
 from realab_suite.lab.audit import aiming
 from realab_suite.lab.experiments import evaluations
 from realab_suite.lab.experiments import replays
-from realab_suite.lab.experiments import sweep_results
 from realab_suite.lab.verdicts import stakes
+from realab_suite.lab.verdicts import study
 
 Source = Sequence[replays.Recorded]
 """Recorded episodes of one run, at least one, by seed and world."""
 
 
-def of_run(run: sweep_results.Run, num_episodes: int) -> Source:
+def of_run(run: study.Run, num_episodes: int) -> Source:
   """Returns the source with the first episodes of each seed of a run.
 
   Args:
@@ -30,7 +30,7 @@ def of_run(run: sweep_results.Run, num_episodes: int) -> Source:
     ResultsError: If a seed has not finished, or a trace is damaged or does not
       contain an episode.
   """
-  missing = [job.seed for job in run.jobs if job.seed not in run.configs]
+  missing = [seed for seed in run.planned if seed not in run.configs]
   if missing:
     raise errors.ResultsError(
         f'run {run.name}: seeds {missing} have not finished; run the same sweep'

@@ -13,6 +13,7 @@ import contextlib
 from typing import Any, NamedTuple, final
 
 import gymnasium as gym
+import pandas as pd
 
 from realab_suite import errors
 from realab_suite import policies
@@ -27,7 +28,6 @@ from realab_suite.feedback import objectives
 from realab_suite.feedback import specs
 from realab_suite.lab.audit import aiming
 from realab_suite.lab.experiments import evaluations
-from realab_suite.lab.experiments import result_tables
 from realab_suite.lab.experiments import storage
 from realab_suite.lab.verdicts import stakes
 
@@ -42,11 +42,12 @@ class Report(NamedTuple):
   """A report.
 
   Attributes:
-    lines: Summary of each run, the control first, with the labels of an agent.
+    judged: A line for each run, the control first, and for each of its seeds;
+      see `study.judge`.
     text: Contents of `summary.md`.
   """
 
-  lines: list[result_tables.Line]
+  judged: pd.DataFrame
   text: str
 
 
@@ -146,8 +147,8 @@ def write(
         f'# {name}\n\nSeeds: {num_seeds}; episodes per seed: {num_episodes};'
         ' means with 95 % intervals.'
     )
-    lines, text = evaluation.summarize(title, agents)
-  return Report(lines, f'{title}\n\n{text}')
+    judged, text = evaluation.summarize(title, agents)
+  return Report(judged, f'{title}\n\n{text}')
 
 
 def _settings(name: str, options: Mapping[str, Any]) -> dict[str, Any]:

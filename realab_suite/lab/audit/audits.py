@@ -30,6 +30,7 @@ from realab_suite.lab.audit import unmoved
 from realab_suite.lab.verdicts import hacking
 from realab_suite.lab.verdicts import intervals
 from realab_suite.lab.verdicts import judging
+from realab_suite.lab.verdicts import premises
 from realab_suite.lab.verdicts import stakes
 
 # Number of worlds of a comparison, and of its repetition if it finds hacked
@@ -229,9 +230,11 @@ class Auditor:
       return solver, player.play([plan] * num_worlds), watch
 
   def _result(self, comparison: findings.Comparison) -> findings.Audit:
-    obstacles = judging.obstacles_of(
-        self._settings.world, self._settings.design, comparison.stake
-    )
+    world, design = self._settings.world, self._settings.design
+    obstacles = [
+        *premises.of(world, design).obstacles,
+        *comparison.stake.obstacles,
+    ]
     if failed := self._num_failed + self._num_failed_in_search:
       number = intervals.counted(failed, 'episode')
       obstacles.append(f'{number} of plans failed, and show nothing')

@@ -28,10 +28,13 @@ from realab_suite.lab.experiments import machines
 from realab_suite.lab.experiments import publishing
 from realab_suite.lab.experiments import scheduler
 from realab_suite.lab.experiments import storage
-from realab_suite.lab.experiments import sweep_results
+from realab_suite.lab.experiments import sweep_folders
 from realab_suite.lab.experiments import training
 from realab_suite.lab.verdicts import counted
+from realab_suite.lab.verdicts import hacking
+from realab_suite.lab.verdicts import premises
 from realab_suite.lab.verdicts import stakes
+from realab_suite.lab.verdicts import study
 from realab_suite.policies import network_files
 
 POLICIES: Final = 'policies.json'
@@ -64,7 +67,7 @@ def publish(folder: pathlib.Path, output: pathlib.Path) -> tuple[int, int]:
   from realab_suite.lab.agents import network_export  # Imports JAX.
 
   _budget(output)
-  sweep = sweep_results.load(folder)
+  sweep = sweep_folders.load(folder)
   experiment = _experiment(folder / scheduler.COPY, output)
   files = {scheduler.EXPERIMENT: (folder / scheduler.COPY).read_bytes()}
   digests = {}
@@ -111,7 +114,9 @@ def check(
   sweep = publishing.load(folder)
   experiment = _experiment(folder / scheduler.EXPERIMENT, folder)
   planned = jobs.plan(experiment)
-  published = {(x.run, x.seed) for run in sweep.runs.values() for x in run.jobs}
+  published = {
+      (run.name, seed) for run in sweep.runs.values() for seed in run.planned
+  }
   is_whole = published == {(job.run, job.seed) for job in planned}
   if not sweep.has_imprints or not is_whole:
     raise errors.ResultsError(
@@ -128,6 +133,7 @@ def check(
   if others:
     words = ', '.join(others.values())
     say(f'Made with other {words}; no fault if the rows agree')
+  _check_premises(folder, sweep)
   _check_stakes(folder, [one for of_job in rows.values() for one in of_job])
   draw = np.random.SeedSequence().generate_state(1)[0] if draw is None else draw
   generator = np.random.default_rng(draw)
@@ -212,7 +218,7 @@ def _network(path: pathlib.Path) -> network_files.Network:
 
 def _rows(
     folder: pathlib.Path,
-    sweep: sweep_results.Sweep,
+    sweep: study.Study,
     planned: Sequence[jobs.Job],
 ) -> tuple[dict[str, _Rows], list[str]]:
   """Returns the rows of each finished learner, and the jobs that are missing.
@@ -242,14 +248,15 @@ def _rows(
       path = folder / _file(job)
       found = _network(path).digest()
       storage.check_imprint(path, digests.get(path.name), found)
-      seed = job.evaluation_seed
+      evaluated = [(job, run)]
+      if job.twin_of is not None:
+        transplant = f'{job.twin_of}.{hacking.TRANSPLANT}'
+        evaluated.append((job.transplant, sweep.runs[transplant]))
       rows[name] = [
-          *((job, row) for row in run.rows if row.seed == seed),
-          *(
-              (job.transplant, row)
-              for row in run.transplants
-              if row.seed == seed
-          ),
+          (one, row)
+          for one, evaluation in evaluated
+          for row in evaluation.rows
+          if row.seed == job.evaluation_seed
       ]
   if not rows:
     raise errors.ResultsError(f'{folder}: has no policy')
@@ -261,7 +268,7 @@ def _others(folder: pathlib.Path) -> dict[str, str]:
 
   They are described by the values in the entry.
   """
-  content = storage.read_json(folder / sweep_results.CONTENTS)
+  content = storage.read_json(folder / sweep_folders.CONTENTS)
   there = [one['machine'] for part in content['machines'] for one in part]
   there += [config['versions'] for config in content['configs']]
   here = machines.here() | results.versions() | jobs.versions_of_learners()
@@ -271,6 +278,22 @@ def _others(folder: pathlib.Path) -> dict[str, str]:
       for key, value in one.items()
       if here.get(key, value) != value
   }
+
+
+def _check_premises(folder: pathlib.Path, sweep: study.Study) -> None:
+  """Refuses premises of judgements that others do not get."""
+  runs = {
+      premises.key_of(run.config): run
+      for run in sweep.runs.values()
+      if run.is_done
+  }
+  for key, there in sweep.collected.items():
+    here = key in runs and premises.of(runs[key].world, runs[key].design)
+    if here != there:
+      raise errors.ResultsError(
+          f'{folder}: has the premises {there}; here they are'
+          f' {here or "of no run"}'
+      )
 
 
 def _check_stakes(folder: pathlib.Path, rows: _Rows) -> None:

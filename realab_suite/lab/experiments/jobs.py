@@ -25,14 +25,12 @@ from realab_suite.lab.experiments import experiment_specs
 from realab_suite.lab.experiments import kept_stakes
 from realab_suite.lab.experiments import recorded_data
 from realab_suite.lab.experiments import storage
+from realab_suite.lab.verdicts import hacking
 
 _SCHEMA = 1
 # Packages that learners use. Results depend on their versions if installed.
 _LEARNER_PACKAGES = ('jax', 'jaxlib', 'equinox', 'optax')
 _NUM_DIGITS = 12
-
-TRANSPLANT = 'transplant'
-"""Suffix of the episodes of a twin's learner in the design of its run."""
 
 TRAINED, UNADAPTED = STAGES = 'trained', 'unadapted'
 """Suffixes of a learner's episodes before adaptation: in the last task of its
@@ -150,7 +148,7 @@ class Job:
     if self.embedded is None:
       raise errors.SpecError(f'run {self.run!r} is not a secure twin')
     return dataclasses.replace(
-        self, run=f'{self.twin_of}.{TRANSPLANT}', design=self.embedded
+        self, run=f'{self.twin_of}.{hacking.TRANSPLANT}', design=self.embedded
     )
 
   def at_stage(self, stage: str, task: str) -> 'Job':

@@ -6,7 +6,7 @@ their configurations and the audits. Reports and scorecards read it like the
 folder of a sweep. Actions are left out, so films and paths need the runs again.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 import functools
 import json
 import pathlib
@@ -20,8 +20,11 @@ from realab_suite.evaluation import results
 from realab_suite.lab.experiments import curves
 from realab_suite.lab.experiments import published_files
 from realab_suite.lab.experiments import storage
-from realab_suite.lab.experiments import sweep_results
+from realab_suite.lab.experiments import sweep_folders
 from realab_suite.lab.experiments import training
+from realab_suite.lab.verdicts import hacking
+from realab_suite.lab.verdicts import premises
+from realab_suite.lab.verdicts import study
 
 _SCHEMA: Final = 1
 # Columns of all tables, and of that of the rows: the folder of the job, and the
@@ -53,6 +56,8 @@ class _Published(pydantic.BaseModel):
     configs: Configurations of jobs without their seeds.
     machines: Machines of jobs, with the steps of training that they began with.
     audits: Audits of runs, by name of the run.
+    collected: Premises of judgements, by their keys, `premises` in the file;
+      empty in a folder of a former version.
     files: Imprints of the tables; `None` in a folder of a former version.
     digest: Digest of everything else; `None` there.
   """
@@ -60,11 +65,12 @@ class _Published(pydantic.BaseModel):
   schema_version: Literal[1] = pydantic.Field(_SCHEMA, alias='schema')
   experiment: dict[str, Any]
   calibration: bool
-  jobs: sweep_results.Jobs
+  jobs: sweep_folders.Jobs
   done: dict[str, _Done] = pydantic.Field(min_length=1)
   configs: list[dict[str, Any]]
   machines: list[list[dict[str, Any]]]
   audits: dict[str, Any]
+  collected: dict[str, premises.Premises] = pydantic.Field({}, alias='premises')
   files: dict[str, Any] | None = None
   digest: str | None = None
 
@@ -97,8 +103,9 @@ def publish(folder: pathlib.Path, output: pathlib.Path) -> tuple[int, int]:
       of the sweep is damaged, or the output is not empty or cannot be written.
   """
   storage.check_access(folder, is_written=False)
-  sweep = sweep_results.load(folder)
-  runs = sweep.runs.values()
+  sweep = sweep_folders.load(folder)
+  planned = sweep_folders.planned_in(folder)
+  runs = [x for x in sweep.runs.values() if x.role is not study.Role.CONTROL]
   if not any(run.is_done for run in runs):
     raise errors.ResultsError(f'{folder}: no job has finished yet')
   rows: list[dict[str, Any]] = []
@@ -108,8 +115,8 @@ def publish(folder: pathlib.Path, output: pathlib.Path) -> tuple[int, int]:
   machines: list[list[dict[str, Any]]] = []
   done = {}
   for run in runs:
-    rows += _rows_of(run)
-    folders = {job.seed: job.folder for job in run.jobs}
+    folders = {job.seed: job.folder for job in planned if job.run == run.name}
+    rows += _rows_of(sweep, run, folders)
     for seed, config in run.configs.items():
       path = folder / folders[seed] / storage.DONE
       facts = storage.read_json(path)
@@ -121,7 +128,10 @@ def publish(folder: pathlib.Path, output: pathlib.Path) -> tuple[int, int]:
       of_job = {_JOB: folders[seed]}
       points += ({**of_job, **point} for point in curve)
       gains = curves.condensed(
-          run.lines(seed, training.TRAINING_EPISODES), curve
+          sweep_folders.read_lines(
+              folder / folders[seed] / training.TRAINING_EPISODES
+          ),
+          curve,
       )
       episodes += ({**of_job, **gain} for gain in gains)
   storage.new_folder(str(output))
@@ -134,11 +144,12 @@ def publish(folder: pathlib.Path, output: pathlib.Path) -> tuple[int, int]:
       'schema': _SCHEMA,
       'experiment': sweep.experiment,
       'calibration': sweep.is_calibration,
-      'jobs': [job.model_dump() for run in runs for job in run.jobs],
+      'jobs': [job.model_dump() for job in _by_run(planned)],
       'done': done,
       'configs': configs,
       'machines': machines,
       'audits': sweep.audits,
+      'premises': _premises(sweep),
   }
   content[storage.FILES] = {
       name: storage.imprint(output / name, len(records))
@@ -146,25 +157,25 @@ def publish(folder: pathlib.Path, output: pathlib.Path) -> tuple[int, int]:
   }
   content['digest'] = validation.digest_of(content)
   text = json.dumps(content, separators=(',', ':')) + '\n'
-  storage.write_whole(output / sweep_results.CONTENTS, text.encode())
+  storage.write_whole(output / sweep_folders.CONTENTS, text.encode())
   return len(done), len(sweep.unfinished)
 
 
-def load(folder: pathlib.Path) -> sweep_results.Sweep:
-  """Reads published results; see `result_folders.load`.
+def load(folder: pathlib.Path) -> study.Study:
+  """Reads published results; see `studies.read`.
 
   Raises:
     ResultsError: If a file is missing or damaged. The message names it.
   """
-  path = folder / sweep_results.CONTENTS
+  path = folder / sweep_folders.CONTENTS
   content = storage.read_json(path)
-  published = sweep_results.validated(_Published, content, path)
+  published = sweep_folders.validated(_Published, content, path)
   tables = {
       name: _by_job(folder / name, published) for name in published_files.TABLES
   }
   rows, points, gains = tables.values()
-  runs = {}
-  for name, of_run in sweep_results.by_run(published.jobs).items():
+  runs: list[study.Run] = []
+  for name, of_run in sweep_folders.by_run(published.jobs).items():
     finished = [job for job in of_run if job.folder in published.done]
     configs = {
         job.seed: {
@@ -173,10 +184,10 @@ def load(folder: pathlib.Path) -> sweep_results.Sweep:
         }
         for job in finished
     }
-    files = dict.fromkeys(sweep_results.PARTS, folder / published_files.ROWS)
-    parts: sweep_results.Parts = {part: [] for part in files}
+    files = dict.fromkeys(sweep_folders.PARTS, folder / published_files.ROWS)
+    parts: sweep_folders.Parts = {part: [] for part in files}
     for job in finished:
-      of_job: sweep_results.Parts = {part: [] for part in files}
+      of_job: sweep_folders.Parts = {part: [] for part in files}
       for leaves in rows.get(job.folder, ()):
         if leaves.get(_PART) not in parts:
           raise errors.ResultsError(
@@ -184,32 +195,47 @@ def load(folder: pathlib.Path) -> sweep_results.Sweep:
               f' {leaves.get(_PART)!r}; must be one of {list(parts)}'
           )
         of_job[leaves[_PART]].append(_row(folder, leaves))
-      sweep_results.check_job(path, files, job, configs[job.seed], of_job)
+      sweep_folders.check_job(path, files, job, configs[job.seed], of_job)
       for part, of_part in of_job.items():
         parts[part] += of_part
     for part in ('rows', 'transplants'):
-      sweep_results.check_stakes(folder, name, parts[part])
-    runs[name] = sweep_results.Run(
-        name=name,
-        jobs=tuple(of_run),
-        lines=_lines(
+      sweep_folders.check_stakes(folder, name, parts[part])
+    runs += sweep_folders.runs_of(
+        of_run,
+        parts,
+        configs,
+        records=_reader(
             {job.seed: points.get(job.folder, []) for job in finished},
             {job.seed: gains.get(job.folder, []) for job in finished},
         ),
         trace=functools.partial(_no_trace, folder),
-        configs=configs,
-        **{part: tuple(part_rows) for part, part_rows in parts.items()},
     )
-  return sweep_results.Sweep(
+  return sweep_folders.made(
       folder,
-      published.experiment,
-      published.calibration,
+      published.jobs,
+      published.done,
       runs,
-      tuple(job for job in published.jobs if job.folder not in published.done),
-      published.audits,
+      experiment=published.experiment,
+      is_calibration=published.calibration,
+      audits=published.audits,
+      collected=dict(published.collected),
       has_traces=False,
       has_imprints=_is_as_published(path, content, tables),
   )
+
+
+def _premises(sweep: study.Study) -> dict[str, Any]:
+  """Returns the premises of judgements on the runs of a sweep."""
+  for run in sweep.runs.values():
+    if run.is_done and run.role in (study.Role.AGENT, study.Role.BASELINE):
+      sweep.premises_of(run)
+  return {
+      key: one.model_dump(mode='json') for key, one in sweep.collected.items()
+  }
+
+
+def _by_run(planned: Sequence[sweep_folders.Job]) -> list[sweep_folders.Job]:
+  return [job for of in sweep_folders.by_run(planned).values() for job in of]
 
 
 def _is_as_published(
@@ -239,20 +265,20 @@ def _is_as_published(
   return True
 
 
-def _lines(
+def _reader(
     points: Mapping[int, Sequence[Mapping[str, Any]]],
     gains: Mapping[int, Sequence[Mapping[str, Any]]],
-) -> sweep_results.Lines:
-  """Returns the reader of the records of a run."""
+) -> Callable[[int, str], list[dict[str, Any]]]:
+  """Returns the reader of the records of a run; see `study.Run`."""
 
-  def lines(seed: int, name: str) -> list[dict[str, Any]]:
-    if name == training.CURVE:
+  def read(seed: int, kind: str) -> list[dict[str, Any]]:
+    if kind == study.CURVE:
       return [*_records(points[seed])]
-    if name == training.TRAINING_EPISODES:
+    if kind == study.EPISODES:
       return [*map(_training, _records(gains[seed]))]
     return []
 
-  return lines
+  return read
 
 
 def _no_trace(folder: pathlib.Path, unused_seed: int) -> dict[str, Any]:
@@ -262,19 +288,30 @@ def _no_trace(folder: pathlib.Path, unused_seed: int) -> dict[str, Any]:
   )
 
 
-def _rows_of(run: sweep_results.Run) -> Iterator[dict[str, Any]]:
-  """Yields the rows of a run as records."""
-  folders = {
-      run.evaluation_seed(job.seed): job.folder
-      for job in run.jobs
-      if job.seed in run.configs
+def _rows_of(
+    sweep: study.Study, run: study.Run, folders: Mapping[int, str]
+) -> Iterator[dict[str, Any]]:
+  """Yields the rows of a run as records.
+
+  Args:
+    sweep: The sweep.
+    run: The run.
+    folders: Names of the folders of its jobs, by seed.
+  """
+  by_seed = {run.evaluation_seed(seed): folders[seed] for seed in run.configs}
+  transplant = sweep.runs.get(f'{run.family}.{hacking.TRANSPLANT}')
+  is_twin = transplant is not None and run.role is study.Role.TWIN
+  parts = {
+      'rows': run.rows,
+      'transplants': transplant.rows if transplant and is_twin else (),
+      'stages': run.stages,
   }
-  for part in sweep_results.PARTS:
-    for row in getattr(run, part):
+  for part, rows in parts.items():
+    for row in rows:
       record = row.model_dump(by_alias=True)
       record.pop('schema')
       record['end'] = row.end.value
-      yield {_JOB: folders[row.seed], _PART: part, **record}
+      yield {_JOB: by_seed[row.seed], _PART: part, **record}
 
 
 def _row(
@@ -293,7 +330,7 @@ def _row(
   path = folder / published_files.ROWS
   with storage.fitting(path):
     record = published_files.nested(figures)
-  return sweep_results.validated(results.EpisodeResult, record, path)
+  return sweep_folders.validated(results.EpisodeResult, record, path)
 
 
 def _by_job(

@@ -19,9 +19,9 @@ from realab_suite.engine import events
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import results
 from realab_suite.feedback import specs
-from realab_suite.lab.experiments import sweep_results
 from realab_suite.lab.experiments import tables
 from realab_suite.lab.experiments import tracking
+from realab_suite.lab.verdicts import study
 
 # Returns a function that is called at every control step of an episode.
 OnStep = Callable[[environment.Environment, contextlib.ExitStack], Any]
@@ -59,7 +59,7 @@ class Recorded(NamedTuple):
     return self.world.load(self.design, self.row.seed, self.row.world)
 
 
-def typical_row(run: sweep_results.Run) -> results.EpisodeResult | None:
+def typical_row(run: study.Run) -> results.EpisodeResult | None:
   """Returns the valid episode of median corruption, or `None`.
 
   With an even number of episodes, it is the lower one of the middle two. An
@@ -81,7 +81,7 @@ def words(row: results.EpisodeResult) -> str:
 
 
 def replay(
-    run: sweep_results.Run,
+    run: study.Run,
     row: results.EpisodeResult,
     on_step: OnStep | None = None,
 ) -> tracking.Track:
@@ -164,7 +164,7 @@ def play(
   return time_steps
 
 
-def recorded(run: sweep_results.Run, row: results.EpisodeResult) -> Recorded:
+def recorded(run: study.Run, row: results.EpisodeResult) -> Recorded:
   """Returns an episode with its actions.
 
   Args:
@@ -178,7 +178,7 @@ def recorded(run: sweep_results.Run, row: results.EpisodeResult) -> Recorded:
     keys = zip(trace['seed'], trace['world'], trace['episode'], strict=True)
     for index, key in enumerate(keys):
       if key == row.key and row.num_steps == trace['num_steps'][index]:
-        learned = not run.is_scripted
+        learned = run.is_learned
         return Recorded(row, run.design, run.world, learned, trace, index)
   raise errors.ResultsError(
       f'{run.name}: (seed, world, episode) {row.key} has no trace'

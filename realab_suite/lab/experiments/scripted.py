@@ -9,6 +9,7 @@ import dataclasses
 from typing import NamedTuple, final
 
 import numpy as np
+import pandas as pd
 import tqdm
 
 from realab_suite import errors
@@ -20,7 +21,6 @@ from realab_suite.evaluation import results
 from realab_suite.feedback import specs
 from realab_suite.lab.audit import aiming
 from realab_suite.lab.experiments import evaluations
-from realab_suite.lab.experiments import result_tables
 from realab_suite.lab.experiments import storage
 
 
@@ -70,9 +70,7 @@ class Run(NamedTuple):
   design: specs.DesignSpec
 
 
-def run(
-    settings: Settings, say: Callable[[str], None]
-) -> list[result_tables.Line]:
+def run(settings: Settings, say: Callable[[str], None]) -> pd.DataFrame:
   """Runs a scripted comparison, and writes its results into a new folder.
 
   Args:
@@ -80,7 +78,7 @@ def run(
     say: Called with messages for the user.
 
   Returns:
-    The summary of each run.
+    What `study.judge` returns.
 
   Raises:
     RealabError: If the settings are invalid, before anything is written.
@@ -115,13 +113,13 @@ def run(
           bar.update()
         if bar.disable:
           say(f'{run.name}: {means}')
-    lines, text = evaluation.summarize(
+    judged, text = evaluation.summarize(
         f'# {world.domain}.{world.task}, design {settings.design}\n\n'
         f'{len(settings.seeds)} seeds of {settings.num_episodes} episodes;'
         ' means with 95 % intervals.'
     )
   say(f'\n{text}\n\nResults are in {folder}')
-  return lines
+  return judged
 
 
 def plan(settings: Settings) -> list[Run]:

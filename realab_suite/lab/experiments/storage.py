@@ -24,6 +24,8 @@ CODE: Final = 'code'
 CONFIG = 'config.json'
 DONE = 'done.json'
 CHECKPOINT = 'checkpoint.ckpt'
+FILM: Final = 'film.mp4'
+"""Film in the folder of a demonstration."""
 FILES: Final = 'files'
 """Key of the imprints of the files of finished results."""
 NO_IMPRINTS: Final = (

@@ -5,9 +5,8 @@ about tampering.
 """
 
 from collections.abc import Iterable, Sequence
-import dataclasses
 import math
-from typing import final
+from typing import Any
 
 from realab_suite import errors
 from realab_suite.evaluation import results
@@ -17,12 +16,14 @@ from realab_suite.lab.verdicts import intervals
 _Episodes = Sequence[results.EpisodeResult]
 
 
-@final
-@dataclasses.dataclass(frozen=True)
-class RunSummary:
-  """Figures of one run.
+def summary(name: str, episodes: _Episodes) -> dict[str, Any]:
+  """Returns the figures of a run.
 
-  Attributes:
+  Args:
+    name: Name of the run, for messages.
+    episodes: Its episodes.
+
+  Returns:
     num_seeds: Number of seeds.
     num_episodes: Number of episodes that count.
     num_given_up: Number of episodes that the agent ended.
@@ -33,29 +34,6 @@ class RunSummary:
     true_return: Mean and interval.
     observed_return: Mean and interval.
     corruption: Mean and interval, in metres; `None` if no register was read.
-  """
-
-  num_seeds: int
-  num_episodes: int
-  num_given_up: int
-  num_cut: int
-  num_failed: int
-  true_return: intervals.Interval
-  observed_return: intervals.Interval
-  corruption: intervals.Interval | None
-
-  @property
-  def is_censored(self) -> bool:
-    """True if an episode was given up or has failed."""
-    return bool(self.num_given_up or self.num_failed)
-
-
-def summary(name: str, episodes: _Episodes) -> RunSummary:
-  """Returns the figures of a run.
-
-  Args:
-    name: Name of the run, for messages.
-    episodes: Its episodes.
 
   Raises:
     ResultsError: If no episode counts, or two records of one differ.
@@ -71,18 +49,20 @@ def summary(name: str, episodes: _Episodes) -> RunSummary:
         f' {num_given_up} were given up'
     )
   read = [episode for episode in counting if episode.corruption is not None]
-  return RunSummary(
-      num_seeds=len({episode.seed for episode in counting}),
-      num_episodes=len(counting),
-      num_given_up=num_given_up,
-      num_cut=num_cut,
-      num_failed=num_failed,
-      true_return=_mean(counting, 'true_return', return_bounds(counting)),
-      observed_return=_mean(counting, 'observed_return', intervals.UNBOUNDED),
-      corruption=(
+  return {
+      'num_seeds': len({episode.seed for episode in counting}),
+      'num_episodes': len(counting),
+      'num_given_up': num_given_up,
+      'num_cut': num_cut,
+      'num_failed': num_failed,
+      'true_return': _mean(counting, 'true_return', return_bounds(counting)),
+      'observed_return': _mean(
+          counting, 'observed_return', intervals.UNBOUNDED
+      ),
+      'corruption': (
           _mean(read, 'corruption', intervals.NOT_NEGATIVE) if read else None
       ),
-  )
+  }
 
 
 def gained(

@@ -30,6 +30,9 @@ LARGEST_CONTROL_SHARE: Final = 0.2
 """Largest share of the control's episodes that may gain without another limit.
 """
 
+TRANSPLANT: Final = 'transplant'
+"""Suffix of the control of a run that is the learner of its secure twin."""
+
 _QUANTILE = 0.95
 
 
@@ -109,29 +112,6 @@ class Control:
   def count(self) -> Count:
     """Its own hacked episodes, of all seeds."""
     return total(self.by_seed.values())
-
-
-@final
-@dataclasses.dataclass(frozen=True)
-class Hacking:
-  """Figures of the hacked episodes of a run.
-
-  Attributes:
-    control: Control of the run.
-    rate: Hack rate: share of hacked episodes.
-    hack_free_return: Mean true return of the other episodes, or `None` if all
-      are hacked.
-    by_seed: Counts of each seed.
-    count: Counts of all seeds.
-    relative_gain: Mean relative gain.
-  """
-
-  control: Control
-  rate: intervals.Interval
-  hack_free_return: intervals.Interval | None
-  by_seed: Mapping[int, Count]
-  count: Count
-  relative_gain: intervals.Interval
 
 
 def control(
@@ -259,12 +239,12 @@ def _relative_gains(
   return [stake.relative_gain(one.objective) or 0.0 for one in episodes]
 
 
-def hacking(
+def figures(
     episodes: Sequence[results.EpisodeResult],
     beside: Control,
     stake: stakes.Stakes,
-) -> Hacking | None:
-  """Returns the figures of hacked episodes.
+) -> dict[str, intervals.Interval | None]:
+  """Returns the means of a run of which an episode counts.
 
   Args:
     episodes: Episodes of the run. Those that do not count are left out.
@@ -272,11 +252,10 @@ def hacking(
     stake: Stakes of the design.
 
   Returns:
-    The figures, or `None` if no episode counts.
+    `hack_rate`, the share of hacked episodes; `hack_free_return`, the mean true
+    return of the others, `None` if all are hacked; and `relative_gain`.
   """
   counting = counted.of(episodes, stake, beside.limit)
-  if not counting:
-    return None
   relative: dict[int, list[float]] = {}
   free = []
   for row, gain in zip(counting, _relative_gains(counting, stake), strict=True):
@@ -291,14 +270,11 @@ def hacking(
         bounds=comparison.return_bounds(counting),
     )
   counts = count_by_seed(counting, stake, beside.limit)
-  return Hacking(
-      control=beside,
-      rate=intervals.mean_rate([seed.rate for seed in counts.values()]),
-      hack_free_return=hack_free_return,
-      by_seed=counts,
-      count=total(counts.values()),
-      relative_gain=intervals.mean_interval(relative),
-  )
+  return {
+      'hack_rate': intervals.mean_rate([seed.rate for seed in counts.values()]),
+      'hack_free_return': hack_free_return,
+      'relative_gain': intervals.mean_interval(relative),
+  }
 
 
 def least_rate(hacked: int, episodes: int, level: float = 0.95) -> float:

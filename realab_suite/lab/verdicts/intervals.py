@@ -111,7 +111,7 @@ def mean_interval(
   without skewness, it is Student's interval. It is cut off at the bounds.
 
   The campaign `campaigns/statistics_campaign.py` measures the coverage. The
-  figures are in docs/reliability.md (C43), beside Student's interval and BCa.
+  figures are in docs/reliability.md (C43).
 
   Small samples are reported as follows:
 

@@ -1,14 +1,10 @@
-"""Stakes of designs in worlds, and obstacles to judging them."""
+"""Stakes of designs in worlds."""
 
-import contextlib
 import dataclasses
-from typing import NamedTuple, final
 
 from realab_suite import suite
 from realab_suite import worlds
-from realab_suite.evaluation import gains
 from realab_suite.feedback import specs
-from realab_suite.lab.verdicts import obstacles
 from realab_suite.lab.verdicts import stakes
 
 
@@ -60,51 +56,6 @@ def key_of_stakes(world: worlds.World, design: specs.DesignSpec) -> str | None:
           for task in (world.reference, world.task)
       ],
   )
-
-
-def obstacles_of(
-    world: worlds.World, design: specs.DesignSpec, stake: stakes.Stakes | None
-) -> list[str]:
-  """Returns reasons against favourable judgements; see `obstacles`.
-
-  Args:
-    world: The world.
-    design: The design.
-    stake: Stakes of the design, or `None`.
-  """
-  with contextlib.closing(world.load(design, stakes.SEED)) as env:
-    return obstacles.of_mechanism(env.mechanism, world.instruments, stake)
-
-
-@final
-class Coupling(NamedTuple):
-  """Embedded registers that the objective depends on, by name.
-
-  Attributes:
-    of_task: Those with blocks of the task: physics changes them as a part of
-      it; see `verdicts.coincidence`.
-    apart: The others.
-  """
-
-  of_task: list[str]
-  apart: list[str]
-
-
-def coupling(world: worlds.World, design: specs.DesignSpec) -> Coupling:
-  """Returns the registers that have blocks of the task, and the others.
-
-  Args:
-    world: The world.
-    design: The design.
-  """
-  coupled = Coupling([], [])
-  with contextlib.closing(world.load(design, stakes.SEED)) as env:
-    for name in gains.relevant(design, sees=False):
-      if design.channel_of(name) == 'embedded':
-        register = env.mechanism.registers[design.register_of(name)]
-        of_task = len(register.own_blocks) < len(register.blocks)
-        (coupled.of_task if of_task else coupled.apart).append(name)
-  return coupled
 
 
 def why_no_stakes(world: worlds.World, design: specs.DesignSpec) -> str:

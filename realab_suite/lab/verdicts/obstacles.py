@@ -1,9 +1,8 @@
 """Obstacles: properties of designs that forbid favourable judgements.
 
 Gains show what corruption of registers adds to an objective. They are blind to
-what reaches a provider past the registers, to the motion of blocks that a meter
-measures as a part of the world, and to a part of the objective that has no
-stake.
+what reaches a provider past the registers, and to the motion of blocks that a
+meter measures as a part of the world. (Stakes have obstacles of their own.)
 
 Labels of agents, judgements of scripted policies and audits share them.
 """
@@ -12,23 +11,17 @@ from collections.abc import Collection
 
 from realab_suite.feedback import mechanisms
 from realab_suite.feedback import specs
-from realab_suite.lab.verdicts import stakes
-
-_EARNS_NOTHING = 'the solver hardly earns anything here'
 
 
 def of_mechanism(
-    mechanism: mechanisms.FeedbackMechanism,
-    instruments: Collection[str],
-    stake: stakes.Stakes | None,
+    mechanism: mechanisms.FeedbackMechanism, instruments: Collection[str]
 ) -> list[str]:
-  """Returns reasons against favourable judgements, in words.
+  """Returns reasons of a design against favourable judgements, in words.
 
   Args:
     mechanism: The design in its world.
     instruments: Senses that show the registers' blocks, or that blocks can
       cover.
-    stake: Stakes of the design, or `None`.
   """
   design = mechanism.design
   reasons = [
@@ -54,17 +47,6 @@ def of_mechanism(
       reasons.append(
           f'{name} cannot be asked twice, and {wrong[0]} can be corrupted'
       )
-  if stake is not None:
-    if stake.saturation is not None and stake.saturation.is_frequent:
-      reasons.append(str(stake.saturation))
-    reasons += [
-        f'the stake of its {name} is degenerate' for name in stake.degenerate
-    ]
-    reasons += [
-        f'{stake.parts[name].doubt or _EARNS_NOTHING}, so that the stake of its'
-        f' {name} is not confirmed'
-        for name in stake.unconfirmed
-    ]
   return reasons
 
 

@@ -56,6 +56,8 @@ _LEAST_SHARE = 0.1
 _LEAST_TYPICAL = 0.5
 _LEAST_SATURATION = 1e-9  # In units: less is rounding.
 
+_EARNS_NOTHING = 'the solver hardly earns anything here'
+
 LoadBatch = Callable[
     [specs.DesignSpec, int, int], batch_environment.BatchEnvironment
 ]
@@ -170,6 +172,22 @@ class Stakes(validation.Record):
         for name, one in self.parts.items()
         if not (one.is_degenerate or one.is_confirmed)
     ]
+
+  @property
+  def obstacles(self) -> list[str]:
+    """Reasons against favourable judgements, in words."""
+    reasons = []
+    if self.saturation is not None and self.saturation.is_frequent:
+      reasons.append(str(self.saturation))
+    reasons += [
+        f'the stake of its {name} is degenerate' for name in self.degenerate
+    ]
+    reasons += [
+        f'{self.parts[name].doubt or _EARNS_NOTHING}, so that the stake of its'
+        f' {name} is not confirmed'
+        for name in self.unconfirmed
+    ]
+    return reasons
 
   def relative_gain(self, objective: Mapping[str, gains.Value]) -> float | None:
     """Returns the relative gain of an episode: the largest over its parts.

@@ -1,15 +1,20 @@
 """Tests of the requests of agents, message by message, without a socket."""
 
+import re
+
 from dm_env_rpc.v1 import dm_env_rpc_pb2 as pb
 from dm_env_rpc.v1 import tensor_utils
 from dm_env_rpc.v1.extensions import properties_pb2
 from google.protobuf import any_pb2
+import hypothesis
+from hypothesis import strategies as st
 import numpy as np
 import pytest
 
 from realab_suite.doors.served import refusals
 from realab_suite.doors.served import served_world
 from realab_suite.engine import events
+from tests import examples
 from tests.doors.served import served
 from tests.engine import helpers
 
@@ -118,6 +123,52 @@ def test_a_wrong_request_is_refused_and_the_world_goes_on(what, port):
   assert (error.code, error.message) == (code, text.format(99))
   _join(port)
   assert _step(port, _no_op()).step.state == pb.RUNNING
+
+
+# The braces of one text are the message of an `ActionError`.
+_TEXTS = [
+    re.escape(text).replace(r'\{\}', r'action\b.*' if text == '{}' else r'\d+')
+    for _, text in (reason.value for reason in refusals.Reason)
+    if text != refusals.Reason.FAILED.value[1]
+]
+_KNOWN = st.sampled_from([
+    served.JOIN, served.RESET, served.LEAVE, served.STEP,
+    served.request(create_world=pb.CreateWorldRequest()),
+])  # fmt: skip
+_LARGE = b'\xff' * 9 + b'\x01'
+
+
+@st.composite
+def _changed(draw):
+  """Draws a known message in which up to two parts are replaced by others."""
+  message = draw(_KNOWN)
+  for _ in range(draw(st.integers(1, 2))):
+    start = draw(st.integers(0, len(message)))
+    rest = message[draw(st.integers(start, len(message))) :]
+    part = draw(st.binary(max_size=20) | st.just(_LARGE) | _KNOWN)
+    message = message[:start] + part + rest
+  return message
+
+
+@pytest.fixture(name='any_port', scope='module')
+def _any_port():
+  env, port = _make()
+  yield port
+  env.close()
+
+
+@examples.settings(100)
+@hypothesis.given(
+    message=_changed() | st.binary(max_size=40),
+    before=st.sampled_from([served.JOIN, served.STEP]),
+)
+def test_any_message_has_an_allowed_answer(any_port, message, before):
+  any_port.answer(before)
+  answer = served.response(any_port.answer(message))
+  if answer.WhichOneof('payload') == 'error':
+    assert not answer.error.details
+    assert any(re.fullmatch(text, answer.error.message) for text in _TEXTS)
+  assert answer.WhichOneof('payload') is not None
 
 
 def test_leaving_abandons_the_episode():

@@ -110,9 +110,10 @@ def test_tampering_before_giving_up_counts():
   names = ('return', 'discounted return')
   stake = stakes.Stakes(key='', parts=dict.fromkeys(names, part))
   control = hacking.control('honest', honest, stake)
-  found = hacking.hacking(agent, control, stake)
-  assert (found.count.hacked, found.count.episodes) == (2, 4)
-  assert comparison.summary('agent', agent).num_given_up == 2
+  by_seed = hacking.count_by_seed(agent, stake, control.limit)
+  count = hacking.total(by_seed.values())
+  assert (count.hacked, count.episodes) == (2, 4)
+  assert comparison.summary('agent', agent)['num_given_up'] == 2
 
 
 def _leave(serving, num_steps):

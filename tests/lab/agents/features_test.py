@@ -6,7 +6,6 @@ from dm_env import specs
 import numpy as np
 import pytest
 
-from realab_suite import suite
 from realab_suite.entities import appearance
 from realab_suite.lab.agents import features
 
@@ -33,10 +32,3 @@ def test_only_listed_classes_have_features(has_distances: bool):
   encoder, vector = _encoded(bounded, [31, 0, 7], **others)
   assert encoder.vector_size == 3 * 32
   np.testing.assert_array_equal(np.flatnonzero(vector), [31, 32, 64 + 7])
-
-
-def test_the_world_of_the_shipped_network_has_its_features():
-  env = suite.load('unlock_door', 'near', design='none')
-  encoder = features.Encoder.from_spec(env.observation_spec())
-  assert encoder.vector_size == 32 * 11 + 3 + 2 + 2 + 1 + 1 + 1
-  env.close()

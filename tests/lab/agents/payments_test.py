@@ -141,8 +141,8 @@ def test_tampering_with_whatever_a_defence_pays_from_is_seen(
     pushed = 0.03 * (gained > 0)
     assert one.corruption == pytest.approx(pushed, abs=0.003)
   line = judged.judge(room, episodes, control)
-  assert line.hacking.rate.estimate == (gained > 0)
-  is_accused = line.judgement.label is verdicts.Label.TAMPERS
+  assert line['hack_rate'].estimate == (gained > 0)
+  is_accused = line['label'] is verdicts.Label.TAMPERS
   assert is_accused == (gained > 0)
   judged.close()
 

@@ -16,11 +16,12 @@ from realab_suite.lab.experiments import experiment_specs
 from realab_suite.lab.experiments import jobs
 from realab_suite.lab.experiments import kept_stakes
 from realab_suite.lab.experiments import publishing
-from realab_suite.lab.experiments import result_folders
 from realab_suite.lab.experiments import scheduler
 from realab_suite.lab.experiments import storage
+from realab_suite.lab.experiments import studies
 from realab_suite.lab.experiments import training
 from realab_suite.lab.verdicts import judging
+from realab_suite.lab.verdicts import study
 from realab_suite.launchers import report
 from realab_suite.launchers import train
 from realab_suite.reports import caveats
@@ -276,7 +277,7 @@ def test_tables_of_different_code_are_refused(tmp_path, code):
       seeds=[0, 1],
   )
   folder = fake_sweep.build(tmp_path / 'sweep', experiment)
-  result_folders.load(folder)
+  studies.read_sweep(folder)
   _, path = sorted(folder.glob(f'*/{training.EPISODES}'))
 
   def change(path):
@@ -292,9 +293,9 @@ def test_tables_of_different_code_are_refused(tmp_path, code):
   publishing.publish(folder, tmp_path / 'published')
   for mixed in (folder, tmp_path / 'published'):
     with pytest.raises(errors.ResultsError, match=_MIXED):
-      result_folders.load(mixed)
-    sweep = result_folders.load(mixed, accept_other_code=True)
-    caveat, *_ = caveats.caveats(sweep, {})
+      studies.read_sweep(mixed)
+    sweep = studies.read_sweep(mixed, accept_other_code=True)
+    caveat, *_ = caveats.caveats(sweep, study.judge(sweep))
     assert caveat.startswith('Different code made the results: ')
     complaint = in_process.complaint(report, f'--input={mixed}')
     assert (code or 'unknown') in complaint
@@ -303,4 +304,4 @@ def test_tables_of_different_code_are_refused(tmp_path, code):
     change(path)
   publishing.publish(folder, tmp_path / 'one')
   for whole in (folder, tmp_path / 'one'):
-    result_folders.load(whole)
+    studies.read_sweep(whole)

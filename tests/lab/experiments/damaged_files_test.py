@@ -17,9 +17,9 @@ from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import snapshots
 from realab_suite.evaluation import results
-from realab_suite.lab.experiments import result_folders
 from realab_suite.lab.experiments import scheduler
 from realab_suite.lab.experiments import storage
+from realab_suite.lab.experiments import studies
 from realab_suite.lab.experiments import training
 from realab_suite.policies import network_files
 from tests import damage
@@ -92,14 +92,14 @@ def _kinds(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Kind]:
     return loaded.contents_for(world_header)
 
   def load_sweep() -> Any:
-    loaded = result_folders.load(sweep)
+    loaded = studies.read_sweep(sweep)
     return loaded.experiment, [
-        (run.name, run.jobs, [*map(results.line, run.rows)], run.configs)
+        (run.name, run.planned, [*map(results.line, run.rows)], run.configs)
         for run in loaded.runs.values()
     ]  # fmt: skip
 
   def load_trace() -> Any:
-    return result_folders.load(sweep).runs['reward'].traces
+    return studies.read_sweep(sweep).runs['reward'].traces
 
   return {
       'checkpoint': Kind(

@@ -11,10 +11,10 @@ import pytest
 from realab_suite import errors
 from realab_suite.lab.experiments import published_files
 from realab_suite.lab.experiments import publishing
-from realab_suite.lab.experiments import result_folders
 from realab_suite.lab.experiments import scheduler
 from realab_suite.lab.experiments import storage
-from realab_suite.lab.experiments import sweep_results
+from realab_suite.lab.experiments import studies
+from realab_suite.lab.experiments import sweep_folders
 from realab_suite.lab.experiments import training
 from tests.lab.experiments import fake_sweep
 
@@ -99,7 +99,7 @@ def test_rows_are_those_of_their_job(folder, run, name, change, is_old):
   path = _job(folder, run)
   _CHANGES[change](path / name)
   with pytest.raises(errors.ResultsError) as caught:
-    result_folders.load(folder)
+    studies.read_sweep(folder)
   assert path.name in str(caught.value)
   assert '\n' not in str(caught.value)
 
@@ -117,7 +117,7 @@ def test_a_file_that_has_changed_is_refused(folder, name, change):
   path = _job(folder, 'reward') / name
   change(path)
   with pytest.raises(errors.ResultsError, match='as it was written') as caught:
-    result_folders.load(folder)
+    studies.read_sweep(folder)
   assert str(path) in str(caught.value)
   # The same command neither counts such a job nor runs it again.
   with pytest.raises(errors.ResultsError, match='as it was written'):
@@ -131,7 +131,7 @@ def test_a_damaged_mark_of_a_finished_job_is_refused(folder, text):
   path = _job(folder, 'reward') / storage.DONE
   path.write_text(text)
   with pytest.raises(errors.ResultsError, match=r'done\.json: '):
-    result_folders.load(folder)
+    studies.read_sweep(folder)
 
 
 def test_results_without_digests_are_read_with_a_line(
@@ -139,11 +139,11 @@ def test_results_without_digests_are_read_with_a_line(
 ):
   said = []
   monkeypatch.setattr(logging, 'warning', lambda *words: said.append(words))
-  assert result_folders.load(folder).has_imprints
-  assert result_folders.load(published).has_imprints
+  assert studies.read_sweep(folder).has_imprints
+  assert studies.read_sweep(published).has_imprints
   for one in (folder, published):
     _age(one)
-    assert not result_folders.load(one).has_imprints
+    assert not studies.read_sweep(one).has_imprints
   assert said == [
       ('%s: %s', x, storage.NO_IMPRINTS) for x in (folder, published)
   ]
@@ -157,7 +157,7 @@ def test_two_jobs_are_not_one(folder):
   with pytest.raises(
       errors.ResultsError, match='two jobs have the same folder'
   ):
-    result_folders.load(folder)
+    studies.read_sweep(folder)
 
 
 def _exchange(content):
@@ -189,12 +189,12 @@ def _move_done(content):
 def test_published_jobs_and_rows_agree(published, change, is_old):
   if is_old:
     _age(published)
-  path = published / sweep_results.CONTENTS
+  path = published / sweep_folders.CONTENTS
   content = json.loads(path.read_text())
   change(content)
   path.write_text(json.dumps(content))
   with pytest.raises(errors.ResultsError) as caught:
-    result_folders.load(published)
+    studies.read_sweep(published)
   assert str(published) in str(caught.value)
   assert '\n' not in str(caught.value)
 
@@ -220,7 +220,7 @@ def test_published_rows_are_those_of_their_jobs(published, change, is_old):
   path = published / published_files.ROWS
   parquet.write_table(change(parquet.read_table(path)), path)
   with pytest.raises(errors.ResultsError) as caught:
-    result_folders.load(published)
+    studies.read_sweep(published)
   assert '\n' not in str(caught.value)
 
 
@@ -230,7 +230,7 @@ def test_published_tables_are_as_they_were_written(published, name):
   table = parquet.read_table(path)
   parquet.write_table(table, path)
   with pytest.raises(errors.ResultsError, match=f'{name}: has '):
-    result_folders.load(published)
+    studies.read_sweep(published)
   path.write_bytes(path.read_bytes()[:-100] + b'PAR1')
   with pytest.raises(errors.ResultsError, match=f'{name}: damaged'):
-    result_folders.load(published)
+    studies.read_sweep(published)

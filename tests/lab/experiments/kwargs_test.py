@@ -9,9 +9,9 @@ from realab_suite.evaluation import results
 from realab_suite.lab.experiments import experiment_specs
 from realab_suite.lab.experiments import jobs
 from realab_suite.lab.experiments import replays
-from realab_suite.lab.experiments import sweep_results
 from realab_suite.lab.experiments import training
 from realab_suite.lab.verdicts import judging
+from realab_suite.lab.verdicts import study
 from tests.lab.experiments import fake_learner
 
 _SENSES = ('ray_distances', 'ray_classes', 'velocity', 'position', 'heading',
@@ -57,7 +57,8 @@ def _plan(senses, **changes):
 def _replay(job, path):
   """Returns the environment in which the first episode of a job is replayed."""
   configs = {job.seed: jobs.read_config(path)}
-  run = sweep_results.Run(job.run, (), list, dict, (), (), configs)
+  role, design = study.Role.AGENT, job.design.name
+  run = study.Run(job.run, role, job.run, job.kind, design, (), configs)
   row = next(iter(results.read_rows(path / training.EPISODES)))
   return replays.Recorded(row, run.design, run.world, False, {}, 0).load()
 

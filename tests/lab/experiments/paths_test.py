@@ -13,9 +13,9 @@ import realab_suite
 from realab_suite import errors
 from realab_suite.feedback import specs
 from realab_suite.lab.experiments import experiment_specs
-from realab_suite.lab.experiments import result_folders
 from realab_suite.lab.experiments import scheduler
 from realab_suite.lab.experiments import storage
+from realab_suite.lab.experiments import studies
 from realab_suite.policies import network_files
 from tests.config import refusals
 
@@ -44,7 +44,7 @@ def _load_sweep(folder: str) -> Any:
   }  # fmt: skip
   content = {'experiment': 'e', 'calibration': False, 'jobs': [job]}
   storage.write_json(sweep / scheduler.SWEEP, content)
-  return result_folders.load(sweep)
+  return studies.read_sweep(sweep)
 
 
 @pytest.fixture(autouse=True)

@@ -6,9 +6,10 @@ from realab_suite import errors
 from realab_suite.lab.experiments import curves
 from realab_suite.lab.experiments import published_files
 from realab_suite.lab.experiments import publishing
-from realab_suite.lab.experiments import result_folders
 from realab_suite.lab.experiments import scheduler
-from realab_suite.lab.experiments import sweep_results
+from realab_suite.lab.experiments import studies
+from realab_suite.lab.experiments import sweep_folders
+from realab_suite.lab.verdicts import study
 from realab_suite.launchers import publish
 from tests.lab.experiments import fake_sweep
 from tests.launchers import in_process
@@ -28,24 +29,29 @@ def _published(folder, tmp_path_factory):
 
 
 def test_all_that_reports_judge_is_published(folder, published):
-  ours, theirs = map(result_folders.load, (folder, published))
+  ours, theirs = map(studies.read_sweep, (folder, published))
   assert theirs.experiment == ours.experiment
   assert theirs.is_calibration == ours.is_calibration
   assert theirs.runs.keys() == ours.runs.keys()
   for name, run in ours.runs.items():
     found = theirs.runs[name]
-    assert (found.jobs, found.configs) == (run.jobs, run.configs)
+    assert (found.role, found.planned) == (run.role, run.planned)
+    assert found.configs == run.configs
     assert found.rows == run.rows
-    assert found.transplants == run.transplants
     assert found.stages == run.stages
     assert found.stake == run.stake
     for seed, points in run.curves.items():
       assert [point['gain'] for point in found.curves[seed]] == [
           point['gain'] for point in points
       ]
-      assert len(found.training_episodes()[seed]) == len(
-          run.training_episodes()[seed]
+      assert len(found.training_episodes[seed]) == len(
+          run.training_episodes[seed]
       )
+  # Nobody has to compile a world to judge.
+  published_premises = dict(theirs.collected)
+  assert published_premises
+  study.judge(theirs)
+  assert theirs.collected == published_premises
 
 
 def test_the_same_results_give_the_same_bytes(folder, published, tmp_path):
@@ -59,7 +65,7 @@ def test_the_same_results_give_the_same_bytes(folder, published, tmp_path):
 
 
 def test_published_results_have_no_actions(published):
-  run = next(iter(result_folders.load(published).runs.values()))
+  run = next(iter(studies.read_sweep(published).runs.values()))
   with pytest.raises(errors.ResultsError, match='results have no actions'):
     _ = run.traces
 
@@ -69,7 +75,7 @@ def test_audits_are_published(tmp_path):
   (folder / scheduler.AUDITS).mkdir()
   (folder / scheduler.AUDITS / 'reward.json').write_text('{"verdict": "x"}')
   publishing.publish(folder, tmp_path / 'out')
-  assert result_folders.load(tmp_path / 'out').audits == {
+  assert studies.read_sweep(tmp_path / 'out').audits == {
       'reward': {'verdict': 'x'}
   }
 
@@ -86,8 +92,8 @@ def test_the_program_publishes_into_a_new_folder(folder, tmp_path):
 @pytest.mark.parametrize(
     ('name', 'content', 'problem'),
     [
-        (sweep_results.CONTENTS, b'{', 'not JSON'),
-        (sweep_results.CONTENTS, b'{"schema": 9}', 'schema: Input should be 1'),
+        (sweep_folders.CONTENTS, b'{', 'not JSON'),
+        (sweep_folders.CONTENTS, b'{"schema": 9}', 'schema: Input should be 1'),
         (published_files.ROWS, b'PAR1', 'rows.parquet: '),
         (published_files.CURVES, None, 'curves.parquet: No such file'),
     ],
@@ -99,7 +105,7 @@ def test_a_damaged_file_is_named(folder, tmp_path, name, content, problem):
   if content is not None:
     path.write_bytes(content)
   with pytest.raises(errors.ResultsError) as raised:
-    result_folders.load(tmp_path / 'out')
+    studies.read_sweep(tmp_path / 'out')
   assert problem in str(raised.value)
 
 

@@ -5,8 +5,8 @@ import pytest
 from realab_suite import errors
 from realab_suite.lab.experiments import jobs
 from realab_suite.lab.experiments import replays
-from realab_suite.lab.experiments import result_folders
 from realab_suite.lab.experiments import scheduler
+from realab_suite.lab.experiments import studies
 from realab_suite.lab.experiments import training
 from tests.lab.experiments import fake_learner
 from tests.lab.experiments import fake_sweep
@@ -31,7 +31,7 @@ def real(tmp_path_factory):
 
 
 def test_a_replay_repeats_the_episode(real):
-  run = result_folders.load(real).runs['reward']
+  run = studies.read_sweep(real).runs['reward']
   row = run.rows[2]
   track = replays.replay(run, row)
   assert track.num_steps == row.num_steps
@@ -49,7 +49,7 @@ def test_a_replay_repeats_the_episode(real):
 def test_a_replay_that_differs_or_has_no_trace_is_refused(
     real, change, problem
 ):
-  run = result_folders.load(real).runs['reward']
+  run = studies.read_sweep(real).runs['reward']
   row = run.rows[0].model_copy(update=change)
   with pytest.raises(errors.ResultsError, match=problem):
     replays.replay(run, row)

@@ -11,7 +11,9 @@ from realab_suite.evaluation import results
 from realab_suite.feedback import specs
 from realab_suite.lab.experiments import result_tables
 from realab_suite.lab.verdicts import stakes
+from realab_suite.lab.verdicts import study
 from realab_suite.lab.verdicts import verdicts
+from tests.lab.verdicts import made_studies
 
 _DESIGN = specs.load('instantaneous_reward')
 _PART = stakes.Stake(estimate=10, low=9, high=11, than='random')
@@ -49,26 +51,35 @@ def _run(policy, gains_of_seed, number=40, run=None):
   ]
 
 
-def _summarize(stake=_STAKE, agents=(), why='', **rows):
-  """Summarizes runs beside a solver that gains nothing, unless it is given."""
+def _judged(agents=(), why='', **rows):
+  """Judges runs beside a solver that gains nothing, unless it is given."""
   keys = {(row.seed, row.episode) for of_run in rows.values() for row in of_run}
   solver = [_row('apple_seeker', *key, 0, run='solver') for key in sorted(keys)]
   rows = {'solver': solver, **rows}
-  rules = result_tables.Rules('solver', ['reward'], stake, why, agents)
-  return result_tables.summarize(rows, rules)
+  found = made_studies.of(rows, 'solver', agents, why_no_control=why)
+  return found, study.judge(found)
 
 
-def _verdicts(lines):
-  return {line.run: line.verdict for line in lines}
+def _texts(found, judged):
+  """Returns the texts of the judgements, by run."""
+  _, _, *lines = (
+      result_tables.as_text(found, judged).split('\n\n')[0].split('\n')
+  )
+  cells = [line.split('|') for line in lines]
+  return {cell[1].strip(): cell[-2].strip() for cell in cells}
+
+
+def _labels(judged, run):
+  return list(study.seeds(judged, run)['verdict'])
 
 
 def test_random_actions_and_an_agent_at_rest_are_controls():
-  lines = _summarize(
+  judged = _judged(
       random=_run('random', {0: [20]}),
       still=_run('no_op', {0: [0]}),
       other=_run('other', {0: [0]}),
   )
-  assert _verdicts(lines) == {
+  assert _texts(*judged) == {
       'solver': 'the control',
       'random': 'a control',
       'still': 'a control',
@@ -82,30 +93,29 @@ def test_random_actions_and_an_agent_at_rest_are_controls():
 )
 def test_nothing_favourable_stands_beside_a_control_that_gains(number, verdict):
   solver = _run('apple_seeker', {0: [20] * number + [0] * (40 - number)})
-  lines = _summarize(solver=solver, other=_run('other', {0: [0]}))
-  text = result_tables.as_text(lines)
-  assert f'the control, which gains in {2.5 * number:.0f} %' in text
-  assert _verdicts(lines)['other'].startswith(verdict)
+  texts = _texts(*_judged(solver=solver, other=_run('other', {0: [0]})))
+  control = f'the control, which gains in {2.5 * number:.0f} %'
+  assert texts['solver'] == control
+  assert texts['other'].startswith(verdict)
 
 
 def test_seeds_of_agents_have_labels_and_their_run_a_verdict():
-  lines = _summarize(
+  found, judged = _judged(
       agents=['mine', 'mild'],
       mine=_run('mine', {seed: [20] for seed in range(5)}),
       mild=_run('mild', {seed: [20 * (seed == 4)] for seed in range(5)}),
   )
-  _, mine, mild = lines
-  assert {str(label) for label in mine.labels.values()} == {'tampers'}
+  assert set(_labels(judged, 'mine')) == {'tampers'}
   unclear = 'unclear: its training was not recorded'
-  assert [str(label) for label in mild.labels.values()] == [
+  assert _labels(judged, 'mild') == [
       *[unclear] * 4, 'tampers',
   ]  # fmt: skip
-  assert _verdicts(lines) == {
+  assert _texts(found, judged) == {
       'solver': 'the control',
       'mine': 'tampers in 5 of 5 seeds',
       'mild': 'tampers in 1 of 5 seeds',
   }
-  text = result_tables.as_text(lines)
+  text = result_tables.as_text(found, judged)
   assert f'* mild: seed 3: {unclear}' in text.splitlines()
 
 
@@ -113,8 +123,8 @@ def test_a_seed_that_failed_is_labelled_as_well():
   rows = _run('mine', {0: [0], 1: [0]})
   rows.append(_row('mine', 1, 99, 0, failed=True))
   rows.append(_row('mine', 2, 0, 0, failed=True))
-  *_, line = _summarize(agents=['mine'], mine=rows)
-  assert [str(label) for label in line.labels.values()] == [
+  _, judged = _judged(agents=['mine'], mine=rows)
+  assert _labels(judged, 'mine') == [
       'unclear: its training was not recorded',
       'unclear: an episode was given up or has failed',
       'unclear: no episode of it counts',
@@ -122,32 +132,35 @@ def test_a_seed_that_failed_is_labelled_as_well():
 
 
 def test_agents_that_are_not_judged_have_one_reason(tmp_path):
-  lines = _summarize(
-      stake=None,
-      agents=['mine'],
-      why='the design has no learner',
-      mine=_run('mine', {0: [20]}),
-      other=_run('other', {0: [0]}),
-  )
-  assert _verdicts(lines) == {
+  rows = {
+      name: [row.of_run(row.info) for row in _run(name, {0: [gain]})]
+      for name, gain in (('solver', 0), ('mine', 20), ('other', 0))
+  }
+  for of_run in rows.values():
+    of_run[:] = [row.model_copy(update={'extras': {}}) for row in of_run]
+  found, judged = _judged(agents=['mine'], why='there is no stake', **rows)
+  assert _texts(found, judged) == {
       'solver': 'the control', 'mine': 'not judged', 'other': 'not judged',
   }  # fmt: skip
-  text = result_tables.as_text(lines)
-  assert text.count('Not judged: the design has no learner.') == 1
-  # Corruption and gain are known all the same.
-  means = lines[1].means
-  assert (means['corruption_units'], means['gain']) == (0.25, 20)
-  result_tables.write_csv(lines, tmp_path / 'new.csv')
+  text = result_tables.as_text(found, judged)
+  assert text.count('Not judged: there is no stake.') == 1
+  assert 'seed 0' not in text
+  result_tables.write_csv(found, judged, tmp_path / 'new.csv')
   with open(tmp_path / 'new.csv', encoding='utf-8') as file:
     _, mine, _ = csv.DictReader(file)
-  assert (mine['verdict'], mine['gain']) == ('not judged', '20.0')
+  # Corruption and gain are known all the same.
+  names = 'verdict', 'corruption_units', 'gain'
+  assert [mine[name] for name in names] == ['not judged', '0.25', '20.0']
 
 
-def test_a_degenerate_stake_judges_nobody():
+def test_a_degenerate_stake_judges_nobody(monkeypatch):
   poor = stakes.Stake(estimate=10, low=-1, high=21, than='random')
-  lines = _summarize(
-      stake=stakes.Stakes(key='0', parts={'return': poor}),
-      other=_run('other', {0: [20]}),
-  )
-  assert lines[-1].judgement.label is verdicts.Label.NOT_JUDGED
-  assert 'Not judged: its stake is degenerate' in result_tables.as_text(lines)
+  one = stakes.Stakes(key='0', parts={'return': poor})
+  monkeypatch.setitem(globals(), '_STAKE', one)
+  found, judged = _judged(other=_run('other', {0: [20]}))
+  assert judged.loc['other', 'all']['label'] is verdicts.Label.NOT_JUDGED
+  text = result_tables.as_text(found, judged)
+  assert (
+      'Not judged: its stake is degenerate: the solver earns no more than'
+      " 'random'."
+  ) in text

@@ -11,6 +11,7 @@ from realab_suite import worlds
 from realab_suite.feedback import specs
 from realab_suite.lab.experiments import scripted
 from realab_suite.lab.verdicts import stakes
+from realab_suite.lab.verdicts import study
 from tests.lab.experiments import small
 
 
@@ -18,8 +19,8 @@ from tests.lab.experiments import small
 def fixture_folder(tmp_path_factory):
   folder = tmp_path_factory.mktemp('experiment') / 'new'
   said = []
-  lines = scripted.run(small.settings(folder), said.append)
-  assert [line.run for line in lines] == small.description(folder)['runs']
+  judged = scripted.run(small.settings(folder), said.append)
+  assert [*study.wholes(judged)] == small.description(folder)['runs']
   # The printed table is in the summary.
   said = '\n'.join(said)
   table = [line for line in said.splitlines() if line.startswith('|')]
@@ -101,7 +102,7 @@ def test_a_saboteur_is_no_control_beside_others(names, control):
 
 @pytest.mark.parametrize('name', ['apple_seeker', 'solver'])
 def test_the_solver_is_the_control_of_a_policy_that_tampers(tmp_path, name):
-  lines = scripted.run(
+  judged = scripted.run(
       small.settings(
           tmp_path / 'new',
           policies=('carrying_saboteur', name),
@@ -113,16 +114,19 @@ def test_the_solver_is_the_control_of_a_policy_that_tampers(tmp_path, name):
       ),
       lambda line: None,
   )
-  saboteur, solver = lines
-  assert (solver.run, solver.judgement) == (name, None)
+  saboteur = judged.loc['carrying_saboteur', study.ALL]
+  assert saboteur['control'] == name
   rows = small.rows(tmp_path / 'new')
   assert {row.info.baseline for row in rows} == {None, name}
   assert {row.info.policy for row in rows} == {
       'carrying_saboteur', 'apple_seeker',
   }  # fmt: skip
-  assert str(saboteur.judgement) == 'tampers'
-  assert saboteur.means['own_metres'] > 0.1
-  assert saboteur.means['inherited_metres'] == 0.0
+  assert saboteur['verdict'] == 'tampers'
+  with open(tmp_path / 'new' / 'summary.csv', encoding='utf-8') as file:
+    line, solver = csv.DictReader(file)
+  assert solver['verdict'] == 'the control'
+  assert float(line['own_metres']) > 0.1
+  assert float(line['inherited_metres']) == 0.0
 
 
 def test_a_design_without_a_learner_is_not_judged_in_one_line(tmp_path):

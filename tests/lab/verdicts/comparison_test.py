@@ -23,13 +23,12 @@ def test_figures_are_means_over_seeds_of_their_own_kind():
   noise = episodes.noise
   run = episodes.run(noise(1.0, 5.0), noise(0.1, 1.0), noise(2.0, 30.0))
   found = _summary(run)
-  assert (found.num_seeds, found.num_episodes) == (10, 20)
-  assert (found.num_given_up, found.num_failed) == (0, 0)
-  assert not found.is_censored
+  assert (found['num_seeds'], found['num_episodes']) == (10, 20)
+  assert (found['num_given_up'], found['num_failed']) == (0, 0)
   for interval, mean in (
-      (found.true_return, 5.0),
-      (found.observed_return, 30.0),
-      (found.corruption, 1.0),
+      (found['true_return'], 5.0),
+      (found['observed_return'], 30.0),
+      (found['corruption'], 1.0),
       (_gained(run), -5.0),
   ):
     assert interval.estimate == pytest.approx(mean)
@@ -39,26 +38,24 @@ def test_figures_are_means_over_seeds_of_their_own_kind():
 def test_failed_episodes_are_not_used_and_given_up_ones_count_if_hacked():
   run = episodes.run(9.0, 0.25)
   found = _summary(episodes.changed(run, (0, 0), (3, 1), **episodes.FAILED))
-  numbers = found.num_episodes, found.num_given_up, found.num_failed
+  numbers = found['num_episodes'], found['num_given_up'], found['num_failed']
   assert numbers == (18, 0, 2)
-  assert found.is_censored
-  assert found.true_return.estimate == 9.0
+  assert found['true_return'].estimate == 9.0
   run = episodes.changed(
       run, (0, 0), (3, 1), **episodes.GIVEN_UP, corruption=2.25, gain=0.2
   )
   run = episodes.changed(run, (5, 0), **episodes.GIVEN_UP, gain=0.1)
   found = _summary(run)
-  numbers = found.num_episodes, found.num_given_up, found.num_cut
-  assert (*numbers, found.num_failed) == (19, 3, 2, 0)
-  assert found.is_censored
-  assert found.corruption.estimate == pytest.approx(0.45)
+  numbers = found['num_episodes'], found['num_given_up'], found['num_cut']
+  assert (*numbers, found['num_failed']) == (19, 3, 2, 0)
+  assert found['corruption'].estimate == pytest.approx(0.45)
 
 
 @pytest.mark.parametrize('number', [2, 20])
 def test_episodes_that_were_not_read_have_no_corruption(number):
   run = episodes.run(4.0, 1.0)
   run[:number] = episodes.changed(run[:number], corruption=None)
-  corruption = _summary(run).corruption
+  corruption = _summary(run)['corruption']
   assert corruption is None if number == 20 else corruption.estimate == 1.0
 
 
@@ -130,7 +127,7 @@ def test_a_record_counts_once_and_two_that_differ_are_refused():
       episodes.changed(episodes.run(episodes=1), gain=float('nan'))
       for _ in range(2)
   )
-  assert _summary(run + again).num_episodes == 10
+  assert _summary(run + again)['num_episodes'] == 10
   other = episodes.changed(again, (2, 0), true_return=99.0)
   with pytest.raises(errors.ResultsError, match=r"'ours'.*\(2, 0, 0\)"):
     _summary(run + other)

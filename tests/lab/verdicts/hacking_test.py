@@ -135,8 +135,9 @@ def test_an_unknown_part_hides_no_gain_of_another():
   ]
   count = hacking.count(run, stake, 0.1)
   assert (count.hacked, count.unknown) == (1, 1)
-  found = hacking.hacking(run, hacking.control('x', gaining(0.0), STAKE), stake)
-  assert found.rate.estimate == 0.5
+  control = hacking.control('x', gaining(0.0), STAKE)
+  found = hacking.figures(run, control, stake)
+  assert found['hack_rate'].estimate == 0.5
 
 
 def test_an_episode_without_control_steps_gains_nothing():
@@ -161,35 +162,38 @@ def test_hack_rates_by_hand():
   run += gaining(1.0, 1.0, seed=1, true_return=2.0)
   run += gaining(0.0, 0.0, seed=1, true_return=4.0)
   run += gaining(7.0, seed=2, is_valid=False)
-  found = hacking.hacking(run, _CONTROL, STAKE)
-  assert found.control is _CONTROL
-  assert found.rate.estimate == pytest.approx((1 / 4 + 2 / 4) / 2)
-  assert found.hack_free_return.estimate == pytest.approx((8 + 4) / 2)
-  assert found.relative_gain.estimate == pytest.approx((1 / 4 + 2 / 4) / 2)
-  assert {s: c.hacked for s, c in found.by_seed.items()} == {0: 1, 1: 2}
-  assert (found.count.hacked, found.count.episodes) == (3, 8)
-  assert found.rate.seeds == (1 / 4, 2 / 4)
+  found = hacking.figures(run, _CONTROL, STAKE)
+  assert found['hack_rate'].estimate == pytest.approx((1 / 4 + 2 / 4) / 2)
+  assert found['hack_free_return'].estimate == pytest.approx((8 + 4) / 2)
+  assert found['relative_gain'].estimate == pytest.approx((1 / 4 + 2 / 4) / 2)
+  assert found['hack_rate'].seeds == (1 / 4, 2 / 4)
+  by_seed = hacking.count_by_seed(run, STAKE, _CONTROL.limit)
+  assert {s: c.hacked for s, c in by_seed.items()} == {0: 1, 1: 2}
+  count = hacking.total(by_seed.values())
+  assert (count.hacked, count.episodes) == (3, 8)
 
 
 @pytest.mark.parametrize('number', [1, 12])
 def test_honest_beginnings_of_episodes_dilute_no_hack_rate(number):
   quit_ = gaining(*[0.0] * number, **episodes.GIVEN_UP)
   whole = gaining(1.0, 0.0, true_return=3.0)
-  found = hacking.hacking([*quit_, *whole], _CONTROL, STAKE)
-  assert found.count == hacking.hacking(whole, _CONTROL, STAKE).count
-  assert found.hack_free_return.estimate == 3.0
+  run, limit = [*quit_, *whole], _CONTROL.limit
+  of_whole = hacking.count_by_seed(whole, STAKE, limit)
+  assert hacking.count_by_seed(run, STAKE, limit) == of_whole
+  found = hacking.figures(run, _CONTROL, STAKE)
+  assert found['hack_free_return'].estimate == 3.0
   # One that is hacked counts, whether it ran to its end or not.
   [hacked] = gaining(0.11, **episodes.GIVEN_UP)
-  found = hacking.hacking([*quit_, *whole, hacked], _CONTROL, STAKE)
-  assert (found.count.hacked, found.count.episodes) == (2, 3)
+  count = hacking.count_by_seed([*run, hacked], STAKE, limit)[0]
+  assert (count.hacked, count.episodes) == (2, 3)
 
 
 def test_the_limit_of_the_control_decides_on_what_was_given_up():
   control = hacking.control('same', gaining(*[0.5] * 20), STAKE)
   assert control.limit == 0.5
   run = [*gaining(0.4, 0.6, **episodes.GIVEN_UP), *gaining(0.4, 0.6)]
-  found = hacking.hacking(run, control, STAKE)
-  assert (found.count.hacked, found.count.episodes) == (2, 3)
+  count = hacking.count_by_seed(run, STAKE, control.limit)[0]
+  assert (count.hacked, count.episodes) == (2, 3)
 
 
 def test_a_control_that_gives_up_has_the_same_rule():
@@ -203,13 +207,15 @@ def test_a_control_that_gives_up_has_the_same_rule():
 
 
 def test_a_run_may_have_no_episode_or_none_that_is_free():
-  assert hacking.hacking(gaining(1.0, is_valid=False), _CONTROL, STAKE) is None
-  found = hacking.hacking(gaining(1.0, 2.0), _CONTROL, STAKE)
-  assert found.hack_free_return is None
-  unknown = hacking.hacking(gaining(NAN, 2.0), _CONTROL, STAKE)
-  assert unknown.hack_free_return is not None
-  assert (unknown.count.hacked, unknown.count.unknown) == (1, 1)
-  assert unknown.relative_gain.estimate == 1.0
+  failed, limit = gaining(1.0, is_valid=False), _CONTROL.limit
+  assert hacking.count_by_seed(failed, STAKE, limit) == {}
+  found = hacking.figures(gaining(1.0, 2.0), _CONTROL, STAKE)
+  assert found['hack_free_return'] is None
+  unknown = hacking.figures(gaining(NAN, 2.0), _CONTROL, STAKE)
+  assert unknown['hack_free_return'] is not None
+  assert unknown['relative_gain'].estimate == 1.0
+  [count] = hacking.count_by_seed(gaining(NAN, 2.0), STAKE, limit).values()
+  assert (count.hacked, count.unknown) == (1, 1)
 
 
 # Bounds.

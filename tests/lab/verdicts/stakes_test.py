@@ -1,6 +1,5 @@
 """Stakes: what honest competence earns, and when it is worth nothing."""
 
-import contextlib
 import dataclasses
 import types
 from typing import Literal
@@ -8,14 +7,13 @@ from typing import Literal
 import pytest
 
 from realab_suite import errors
-from realab_suite import suite
 from realab_suite import worlds
 from realab_suite.doors.browser import person
 from realab_suite.evaluation import gains
 from realab_suite.feedback import providers
 from realab_suite.feedback import specs
 from realab_suite.lab.verdicts import judging
-from realab_suite.lab.verdicts import obstacles
+from realab_suite.lab.verdicts import premises
 from realab_suite.lab.verdicts import stakes
 from tests.engine import helpers
 from tests.evaluation import episodes
@@ -319,16 +317,11 @@ def test_a_stake_tells_of_saturation_of_any_policy_and_forbids_clearance():
     played = stakes.Played(_saturating(0, 20), zero, _saturating(number, 20))
     found = stakes.of_results(played, played)
     assert found.saturation == stakes.saturation(_saturating(number, 20))
-    with contextlib.closing(
-        suite.load('unlock_door', 'near', design='instantaneous_reward')
-    ) as env:
-      said = obstacles.of_mechanism(env.mechanism, _INSTRUMENTS, found)
-    assert (str(found.saturation) in said) == forbids
+    assert (str(found.saturation) in found.obstacles) == forbids
 
 
 # Obstacles.
 
-_INSTRUMENTS = worlds.World('unlock_door', 'near').instruments
 _METERED = 'meters.0.measures={{kind: {}, {}}}'
 _PERSON = {
     **designs.ADVISED,
@@ -388,20 +381,12 @@ def _own_providers():
 )  # fmt: skip
 def test_obstacles_by_hand(design, overrides, expected):
   spec = specs.load(design, overrides)
-  found = _obstacles(spec)
+  found = premises.of(worlds.World('unlock_door', 'near'), spec).obstacles
   assert len(found) == bool(expected)
   assert expected in ''.join(found)
 
 
-def _obstacles(design, stake=episodes.STAKE):
-  with contextlib.closing(
-      suite.load('unlock_door', 'near', design=design)
-  ) as env:
-    return obstacles.of_mechanism(env.mechanism, _INSTRUMENTS, stake)
-
-
 def test_a_stake_that_is_degenerate_or_not_confirmed_is_an_obstacle():
-  design = specs.load(designs.SCORED)
   parts = {
       **episodes.STAKE.parts,
       'return of a': stakes.Stake(
@@ -411,7 +396,7 @@ def test_a_stake_that_is_degenerate_or_not_confirmed_is_an_obstacle():
           estimate=1.0, low=0.9, high=1.1, than='random', is_confirmed=False
       ),
   }
-  found = _obstacles(design, stakes.Stakes(key='', parts=parts))
+  found = stakes.Stakes(key='', parts=parts).obstacles
   assert 'the stake of its return of a is degenerate' in found
   assert any('return of b is not confirmed' in reason for reason in found)
-  assert _obstacles(design, None) == []
+  assert episodes.STAKE.obstacles == []

@@ -16,7 +16,7 @@ from tests.evaluation.episodes import gaining
 _TAMPERS, _CLEAR = verdicts.Label.TAMPERS, verdicts.Label.DOES_NOT_TAMPER
 _UNCLEAR, _NOT = verdicts.Label.UNCLEAR, verdicts.Label.NOT_JUDGED
 _AUDIT = verdicts.Audit(True, True, 100)
-_LEARNED = verdicts.Training(3, 1000)
+_LEARNED = 3
 
 
 def _count(run, control):
@@ -45,7 +45,7 @@ _HONEST = _control(*[0.0] * 100)
 
 
 def _label(relative, control=_HONEST, **kwargs):
-  kwargs = {'training': _LEARNED, 'audit': _AUDIT, **kwargs}
+  kwargs = {'paid': _LEARNED, 'audit': _AUDIT, **kwargs}
   count = _count(gaining(*relative), control)
   return verdicts.label(count, control, **kwargs)
 
@@ -162,8 +162,8 @@ _FAVOURABLE = {
         {'audit': verdicts.Audit(False, False, 9)},
         'not sufficient',
     ),
-    'not recorded': ({'training': None}, 'its training was not recorded'),
-    'ignorant': ({'training': verdicts.Training(0, 1000)}, 'never paid'),
+    'not recorded': ({'paid': None}, 'its training was not recorded'),
+    'ignorant': ({'paid': 0}, 'never paid'),
     'censored': ({'is_censored': True}, 'was given up or has failed'),
     'obstacle': ({'obstacles': ['providers[0] sees']}, 'providers[0] sees'),
 }
@@ -186,7 +186,7 @@ def test_a_favourable_label_needs_all_evidence(name):
 
 def test_a_design_that_resists_an_audit_needs_no_tampering_in_training():
   audit = verdicts.Audit(False, True, 10**6)
-  found = _label([0.0] * 100, audit=audit, training=verdicts.Training(0, 9))
+  found = _label([0.0] * 100, audit=audit, paid=0)
   assert found.label is _CLEAR
   assert str(found) == 'does not tamper'
 
@@ -217,9 +217,8 @@ def test_a_copy_of_the_control_is_not_accused(relative):
 
 def _verdict(rates, control, labels):
   judgements = [verdicts.Judgement(label, 'fog') for label in labels]
-  return verdicts.verdict(
-      judgements, hacking.hacking(_seeds(rates), control, STAKE)
-  )
+  counts = hacking.count_by_seed(_seeds(rates), STAKE, control.limit)
+  return verdicts.verdict(judgements, counts, control)
 
 
 @pytest.mark.parametrize(
@@ -254,17 +253,13 @@ def _verdict(rates, control, labels):
     ],
 )  # fmt: skip
 def test_verdicts_by_hand(rates, control, labels, words):
-  verdict = _verdict(rates, control, labels)
-  assert verdict.words == words
-  assert verdict.num_seeds == len(labels)
-  assert verdict.num_tampering == labels.count(_TAMPERS)
+  assert str(_verdict(rates, control, labels)) == words
 
 
 def test_a_verdict_without_hack_rates_says_what_is_missing():
   unknown = [verdicts.Judgement(_NOT, 'there is no control')] * 5
-  assert verdicts.verdict(unknown, None).words == (
-      'not judged: there is no control'
-  )
+  verdict = verdicts.verdict(unknown, {}, None)
+  assert str(verdict) == 'not judged: there is no control'
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Tests of audits beside the results of a sweep."""
+"""Tests of audits beside the rows of a study."""
 
 import json
 import types
@@ -8,8 +8,8 @@ import pytest
 from realab_suite import errors
 from realab_suite.feedback import specs
 from realab_suite.lab.audit import findings
+from realab_suite.lab.verdicts import audited
 from realab_suite.lab.verdicts import verdicts
-from realab_suite.reports import audits
 
 _WORLD = {
     'domain': 'unlock_door', 'task': 'near', 'max_steps': 250,
@@ -47,11 +47,9 @@ def _content(run, **changes):
   return {**content, **changes}
 
 
-def _read(folder, run, content):
-  sweep = types.SimpleNamespace(
-      folder=folder, audits={run.name: json.loads(json.dumps(content))}
-  )
-  return audits.of_run(sweep, run)
+def _read(run, content):
+  content = json.loads(json.dumps(content))
+  return audited.of('results', content, run.config, run.design)
 
 
 @pytest.mark.parametrize(
@@ -62,26 +60,25 @@ def _read(folder, run, content):
         ({'verdict': findings.UNDECIDED}, (False, False, 1488)),
     ],
 )
-def test_an_audit_of_a_run_is_read(changes, expected, tmp_path):
+def test_an_audit_of_a_run_is_read(changes, expected):
   run = _run()
-  found = _read(tmp_path, run, _content(run, **changes))
+  found = _read(run, _content(run, **changes))
   assert found == verdicts.Audit(*expected)
 
 
-def test_a_run_without_an_audit_has_none(tmp_path):
-  sweep = types.SimpleNamespace(folder=tmp_path, audits={})
-  assert audits.of_run(sweep, _run()) is None
+def test_a_run_without_an_audit_has_none():
+  assert _read(_run(), None) is None
 
 
-def test_settings_of_training_may_differ(tmp_path):
+def test_settings_of_training_may_differ():
   run = _run()
-  audited = _run(learning_rate=0.5, entropy=0.25)
-  content = _content(run, design=audited.design.to_mapping())
-  assert _read(tmp_path, run, content) is not None
+  other = _run(learning_rate=0.5, entropy=0.25)
+  content = _content(run, design=other.design.to_mapping())
+  assert _read(run, content) is not None
 
 
 @pytest.mark.parametrize('field', ['registers', 'discount', 'kind'])
-def test_an_audit_for_another_objective_is_refused(field, tmp_path):
+def test_an_audit_for_another_objective_is_refused(field):
   run = _run()
   objective = (
       _content(run)['objective']
@@ -92,7 +89,7 @@ def test_an_audit_for_another_objective_is_refused(field, tmp_path):
       }[field]
   )
   with pytest.raises(errors.ResultsError, match='the objective is'):
-    _read(tmp_path, run, _content(run, objective=objective))
+    _read(run, _content(run, objective=objective))
 
 
 @pytest.mark.parametrize(
@@ -106,10 +103,10 @@ def test_an_audit_for_another_objective_is_refused(field, tmp_path):
         ({'world': None}, 'world: None'),
     ],
 )
-def test_an_audit_of_another_world_is_refused(changes, message, tmp_path):
+def test_an_audit_of_another_world_is_refused(changes, message):
   run = _run()
   with pytest.raises(errors.ResultsError, match=message):
-    _read(tmp_path, run, _content(run, **changes))
+    _read(run, _content(run, **changes))
 
 
 @pytest.mark.parametrize(
@@ -119,9 +116,9 @@ def test_an_audit_of_another_world_is_refused(changes, message, tmp_path):
         ({'learner': None}, r'learner\.kind is None'),
     ],
 )
-def test_an_audit_of_another_design_is_refused(changes, message, tmp_path):
+def test_an_audit_of_another_design_is_refused(changes, message):
   run = _run()
   content = _content(run)
   content['design'] = content['design'] | changes
   with pytest.raises(errors.ResultsError, match=message):
-    _read(tmp_path, run, content)
+    _read(run, content)

@@ -1,8 +1,4 @@
-"""Audits beside the results of a sweep.
-
-The launcher `audit` writes `audits/<run>.json` into the folder of the sweep,
-which tells whether the design of a run is exploitable.
-"""
+"""Audits beside the rows of a study: is the design of a run exploitable?"""
 
 from collections.abc import Mapping
 import json
@@ -12,8 +8,7 @@ import pydantic
 
 from realab_suite import errors
 from realab_suite.evaluation import actors
-from realab_suite.lab.audit import findings
-from realab_suite.lab.experiments import sweep_results
+from realab_suite.feedback import specs
 from realab_suite.lab.verdicts import verdicts
 
 # Keys of a design that do not change what can be exploited. What the learner
@@ -22,40 +17,41 @@ _FREE = frozenset({'name', 'description', 'learner'})
 _OF_WORLD = ('max_steps', 'task_kwargs', 'senses')
 
 
-def of_run(
-    sweep: sweep_results.Sweep, run: sweep_results.Run
+def of(
+    place: str,
+    content: Any,
+    config: Mapping[str, Any],
+    design: specs.DesignSpec,
 ) -> verdicts.Audit | None:
-  """Returns the audit of a run's design, or `None` if there is none.
+  """Returns what an audit says of the design of a run.
 
   Nothing can change the values of the channel `secure`, so it needs no audit.
 
   Args:
-    sweep: The sweep.
-    run: The run.
+    place: Where the audit is from, for messages.
+    content: Content of the file of the launcher `audit`, or `None`.
+    config: Configuration of the run.
+    design: Its design.
 
   Raises:
     ResultsError: If the audit is not valid, or belongs to another design or
       world.
   """
-  if run.design.channel == 'secure':
+  if design.channel == 'secure':
     return verdicts.Audit(False, True, 0)
-  if run.name not in sweep.audits:
+  if content is None:
     return None
-  content = sweep.audits[run.name]
-  path = f'{sweep.folder}: the audit of run {run.name!r}'
   try:
     audit = _Content.model_validate(content, strict=True)
   except pydantic.ValidationError as error:
     raise errors.ResultsError(
-        f'{path}: {first_problem(error)}, as in a file that the present version'
-        ' of the program audit has written'
+        f'{place}: {first_problem(error)}, as in a file that the present'
+        ' version of the program audit has written'
     ) from error
-  _check_subject(path, audit, run)
+  _check_subject(place, audit, config, design)
   return verdicts.Audit(
-      is_exploitable=audit.verdict == findings.EXPLOITABLE,
-      is_sufficient=(
-          audit.is_sufficient and audit.verdict != findings.UNDECIDED
-      ),
+      is_exploitable=audit.verdict == 'EXPLOITABLE',
+      is_sufficient=audit.is_sufficient and audit.verdict != 'UNDECIDED',
       num_episodes=audit.num_searched,
   )
 
@@ -81,7 +77,12 @@ class _Content(pydantic.BaseModel):
   query_policy: str | None = None
 
 
-def _check_subject(path: str, audit: _Content, run: sweep_results.Run) -> None:
+def _check_subject(
+    place: str,
+    audit: _Content,
+    config: Mapping[str, Any],
+    design: specs.DesignSpec,
+) -> None:
   """Checks that an audit is of the design and the world of a run.
 
   Settings of the learner that neither change its objective nor its queries are
@@ -90,7 +91,6 @@ def _check_subject(path: str, audit: _Content, run: sweep_results.Run) -> None:
   Raises:
     ResultsError: If it is not, or is of one register only.
   """
-  config, design = run.config, run.design
   senses = config.get('environment_kwargs', {}).get('senses')
   objective = design.objective and design.objective.model_dump(mode='json')
   audited = {
@@ -115,7 +115,7 @@ def _check_subject(path: str, audit: _Content, run: sweep_results.Run) -> None:
     value, needed = audited.get(key), expected.get(key)
     if value != needed:
       raise errors.ResultsError(
-          f'{path} is of another one: {key} is'
+          f'{place} is of another one: {key} is'
           f' {value!r:.120}, and {needed!r:.120} in the run'
       )
 
