@@ -16,6 +16,7 @@ from realab_suite.lab.testing import probes
 from tests.lab.agents import toys
 
 _WORKER = {'policy': 'probe_worker', 'options': {'rest': 0.3}, 'worlds': 0.5}
+_CLONED = {**_WORKER, 'clone_steps': 5}
 _LEARNER = {
     'kind': 'q_learning',
     'reward': 'feedback',
@@ -132,15 +133,10 @@ def _replay(held: Any) -> Any:
 
 
 def test_a_share_of_each_minibatch_begins_where_readings_are_held_back():
-  begin = np.full((3, 8), 20), np.full((3, 8), 4)
-  held = np.array([3, 5]), np.array([1, 2])
-  gates._inject(begin, held, np.random.default_rng(0))
-  slots, worlds = begin
-  assert set(zip(slots[:, :2].flat, worlds[:, :2].flat, strict=True)) == {
-      (3, 1), (5, 2),
-  }  # fmt: skip
-  assert (slots[:, 2:] == 20).all()
-  assert (worlds[:, 2:] == 4).all()
+  begin = np.zeros((3, 8), int), np.zeros((3, 8), int)
+  gates._inject(begin, (np.array([3]), np.array([1])), np.random.default_rng(0))
+  assert begin[0].tolist() == [[3, 3, *[0] * 6]] * 3
+  assert begin[1].tolist() == [[1, 1, *[0] * 6]] * 3
 
 
 @pytest.mark.parametrize(
@@ -236,11 +232,7 @@ def test_a_learner_continues_in_the_middle_of_a_trial_bit_for_bit():
     [
         ({'threshold': -1.0, 'fit_steps': 9}, 'gate.threshold: '),
         (
-            {
-                'threshold': 1.0,
-                'fit_steps': 9,
-                'trusted': {**_WORKER, 'clone_steps': 5},
-            },
+            {'threshold': 1.0, 'fit_steps': 9, 'trusted': _CLONED},
             'trusted.clone_steps: 5; must be 0',
         ),
         (
