@@ -94,11 +94,11 @@ def test_a_problem_of_the_file_is_reported_as_the_files(tmp_path: pathlib.Path):
   assert 'override' not in text
   wrong['registers']['reward'].pop('mass')
   path.write_text(json.dumps(wrong))
-  # A rule between keys, where an override changes another key.
-  text = _refusal(path, 'registers.reward.scale=0.2')
-  assert text == (
-      f'{path}: registers.reward: range [3.0, -3.0] must have low < high'
-  )
+  # A rule between keys; an override changes another key, or is wrong itself.
+  for override in ('registers.reward.scale=0.2', 'dof=loose'):
+    assert _refusal(path, override) == (
+        f'{path}: registers.reward: range [3.0, -3.0] must have low < high'
+    )
 
 
 def test_an_override_replaces_a_wrong_value_of_the_file():

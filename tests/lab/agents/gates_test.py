@@ -16,6 +16,7 @@ from realab_suite.lab.testing import probes
 from tests.lab.agents import toys
 
 _WORKER = {'policy': 'probe_worker', 'options': {'rest': 0.3}, 'worlds': 0.5}
+_CLONED = {**_WORKER, 'clone_steps': 5}
 _LEARNER = {
     'kind': 'q_learning',
     'reward': 'feedback',
@@ -131,6 +132,13 @@ def _replay(held: Any) -> Any:
   }
 
 
+def test_a_share_of_each_minibatch_begins_where_readings_are_held_back():
+  begin = np.zeros((3, 8), int), np.zeros((3, 8), int)
+  gates._inject(begin, (np.array([3]), np.array([1])), np.random.default_rng(0))
+  assert begin[0].tolist() == [[3, 3, *[0] * 6]] * 3
+  assert begin[1].tolist() == [[1, 1, *[0] * 6]] * 3
+
+
 @pytest.mark.parametrize(
     ('convinced', 'others', 'later', 'is_accepted'),
     [
@@ -224,11 +232,7 @@ def test_a_learner_continues_in_the_middle_of_a_trial_bit_for_bit():
     [
         ({'threshold': -1.0, 'fit_steps': 9}, 'gate.threshold: '),
         (
-            {
-                'threshold': 1.0,
-                'fit_steps': 9,
-                'trusted': {**_WORKER, 'clone_steps': 5},
-            },
+            {'threshold': 1.0, 'fit_steps': 9, 'trusted': _CLONED},
             'trusted.clone_steps: 5; must be 0',
         ),
         (
