@@ -22,6 +22,7 @@ from realab_suite.feedback import specs
 from realab_suite.lab.attribution import attribution
 from realab_suite.lab.audit import aiming
 from realab_suite.lab.audit import attacks
+from realab_suite.tasks import collect_apples
 
 
 @providers.PROVIDERS.add('copies_of_two')
@@ -358,6 +359,25 @@ def test_an_audit_attacks_all_blocks_once():
 
 
 # What users get.
+
+
+@pytest.mark.parametrize(
+    ('initial', 'readings'), [('both', [3.0, 3.0]), ('each', [1.0, 2.0])]
+)
+def test_ports_begin_with_one_value_for_all_or_one_for_each(initial, readings):
+  told = {**_ABACUS, 'role': 'memory', 'place': 'station_1', 'initial': initial}
+  offered = {'both': 3.0, 'each_a': 1.0, 'each_b': 2.0, 'both_a': 0.0}
+  env = suite.embed(
+      collect_apples.CollectApples(),
+      {'schema': 1, 'name': 'begun', 'registers': {'told': told}},
+      measurements={
+          name: lambda physics, value=value: np.float64(value)
+          for name, value in offered.items()
+      },
+  )
+  env.reset()
+  register = env.mechanism.registers['told']
+  np.testing.assert_allclose(register.read(env.physics), readings)
 
 
 # Kinds that do not keep to their spec.
