@@ -293,10 +293,13 @@ class Study:
 
     The control is the transplant, or else the baseline of the agent.
     """
+    for one in self.family(run):
+      if one.role is Role.CONTROL and one.rows:
+        return one.name, one.rows
     agent = self.runs.get(run.family, run)
-    for name in (f'{agent.name}.{hacking.TRANSPLANT}', agent.baseline or ''):
-      if name in self.runs and self.runs[name].rows:
-        return name, self.runs[name].rows
+    baseline = self.runs.get(agent.baseline or '')
+    if baseline is not None and baseline.rows:
+      return baseline.name, baseline.rows
     if self.twin(agent) is not None:
       return f'{agent.name}.{hacking.TRANSPLANT}', ()
     return agent.baseline, ()

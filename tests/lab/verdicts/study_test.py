@@ -62,6 +62,17 @@ def test_a_judge_returns_a_line_for_each_run_and_seed():
   assert judged.loc['random', study.ALL]['label'] is verdicts.Label.CONTROL
 
 
+def test_no_agent_makes_itself_the_control_by_its_name():
+  name = 'solver.transplant'
+  found = _study([name, 'mine'], **{
+      name: _rows('x', 9.0, run=name), 'mine': _rows('mine', 9.0),
+  })  # fmt: skip
+  judged = study.judge(found)
+  for run in (name, 'mine'):
+    line = judged.loc[run, study.ALL]
+    assert (line['control'], line['num_tampering']) == ('solver', 3)
+
+
 @pytest.mark.parametrize(
     ('saturated', 'is_judged'),
     # More than 5 % of 60 are 4.
