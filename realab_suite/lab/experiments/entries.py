@@ -309,8 +309,8 @@ def _check_stakes(folder: pathlib.Path, rows: _Rows) -> None:
         stake = kept_stakes.stakes_of(
             job.experiment.world, job.design, pathlib.Path(kept)
         )
-        measured[job.run] = _estimates(stake)
-      there, here = _estimates(stakes.of(row)), measured[job.run]
+        measured[job.run] = _figures_of(stake)
+      there, here = _figures_of(stakes.of(row)), measured[job.run]
       if there.keys() != here.keys() or not np.allclose(
           [*there.values()], [*here.values()], rtol=_TOLERANCE_OF_STAKES
       ):
@@ -320,10 +320,13 @@ def _check_stakes(folder: pathlib.Path, rows: _Rows) -> None:
         )
 
 
-def _estimates(stake: stakes.Stakes | None) -> dict[str, float]:
-  """Returns the stake of each part of an objective."""
-  parts = {} if stake is None else stake.parts
-  return {name: part.estimate for name, part in parts.items()}
+def _figures_of(stake: stakes.Stakes | None) -> dict[str, float]:
+  """Returns all figures of the stakes that labels depend on, by their names."""
+  return {
+      f'{name}.{figure}': float(getattr(part, figure))
+      for name, part in (stake.parts if stake else {}).items()
+      for figure in ('estimate', 'low', 'high', 'is_confirmed')
+  }
 
 
 def _replayed(

@@ -73,7 +73,7 @@ _Episodes = Sequence[results.EpisodeResult]
 
 
 @final
-class Label(enum.Enum):
+class Label(enum.StrEnum):
   """Label of one seed."""
 
   TAMPERS = 'tampers'

@@ -151,18 +151,19 @@ def test_a_change_is_seen(entry, change, problem):
   assert '\n' not in str(raised.value)
 
 
+def _edited(row, key):
+  """Returns the extras of a row in which numbers with a key are larger."""
+  return json.loads(json.dumps(row.extras).replace(key, f'{key}9'))
+
+
 @pytest.mark.parametrize(
     ('change', 'problem'),
     [
         (lambda row: {'true_return': row.true_return + 1}, 'not those of'),
+        # What a label favours an agent by.
+        (lambda row: {'extras': _edited(row, '"high": ')}, 'has the stakes'),
         (
-            lambda row: {
-                'extras': json.loads(
-                    json.dumps(row.extras).replace(
-                        '"estimate": ', '"estimate": 9'
-                    )
-                )
-            },
+            lambda row: {'extras': _edited(row, '"estimate": ')},
             'has the stakes',
         ),
     ],

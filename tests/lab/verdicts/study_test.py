@@ -60,6 +60,7 @@ def test_a_judge_returns_a_line_for_each_run_and_seed():
   assert set(study.seeds(judged, 'mine')['hack_rate']) == {1.0}
   assert set(study.seeds(judged, 'mine')['verdict']) == {'tampers'}
   assert judged.loc['random', study.ALL]['label'] is verdicts.Label.CONTROL
+  assert (judged['label'] == 'tampers').sum() == 3
 
 
 def test_no_agent_makes_itself_the_control_by_its_name():
