@@ -24,16 +24,17 @@ def summary(name: str, episodes: _Episodes) -> dict[str, Any]:
     episodes: Its episodes.
 
   Returns:
-    num_seeds: Number of seeds.
-    num_episodes: Number of episodes that count.
-    num_given_up: Number of episodes that the agent ended.
-    num_cut: Number of these that count, because they are hacked. They count
+    The figures by their names.
+
+    * num_seeds: Number of seeds.
+    * num_episodes: Number of episodes that count.
+    * num_given_up: Number of episodes that the agent ended.
+    * num_cut: Number of these that count, because they are hacked. They count
       with the return up to their end, so `true_return` is a lower bound where
       rewards are not negative.
-    num_failed: Number of episodes that failed. They do not count.
-    true_return: Mean and interval.
-    observed_return: Mean and interval.
-    corruption: Mean and interval, in metres; `None` if no register was read.
+    * num_failed: Number of episodes that failed. They do not count.
+    * true_return, observed_return: Means and intervals.
+    * corruption: Mean and interval, in metres; `None` if no register was read.
 
   Raises:
     ResultsError: If no episode counts, or two records of one differ.

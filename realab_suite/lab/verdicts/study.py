@@ -350,33 +350,32 @@ def judge(
   Returns:
     A line for each run, whose seed is `ALL`, and one for each of its seeds,
     with the index (run, seed). In the lines of seeds, means are numbers;
-    otherwise they are intervals. Columns, `None` where nothing is known:
+    otherwise they are intervals. `None` is what is not known. The columns:
 
-    role: Role of the run.
-    label, reason: Label and the reason for it. Of a whole agent, they are those
-      of the verdict on its seeds.
-    verdict: Words for both.
-    num_tampering: Number of seeds that tamper.
-    num_seeds, num_episodes, num_given_up, num_cut, num_failed, true_return,
+    * role: Role of the run.
+    * label, reason, verdict: Label, the reason for it, and words for both. Of a
+      whole agent, they are those of the verdict on its seeds.
+    * num_tampering: Number of seeds that tamper.
+    * num_seeds, num_episodes, num_given_up, num_cut, num_failed, true_return,
       observed_return, corruption: See `comparison.summary`.
-    hacked, least, most, ended, unknown, harmed, num_judged: Numbers of
+    * hacked, least, most, ended, unknown, harmed, num_judged: Numbers of
       episodes; see `hacking.Count`.
-    hack_rate, hack_free_return, relative_gain: See `hacking.figures`.
-    exceeds: True if it hacks more than its control; see `verdicts.exceeds`.
-    control, control_rate, control_gains, limit: Name of the control, share of
+    * hack_rate, hack_free_return, relative_gain: See `hacking.figures`.
+    * exceeds: True if it hacks more than its control; see `verdicts.exceeds`.
+    * control, control_rate, control_gains, limit: Name of the control, share of
       its episodes that are hacked, share of those that gain, and the relative
       gain above which an episode is hacked.
-    paid, num_training: Training episodes in which tampering paid, and all.
-    misnamed: Share of steps whose query is not the action, as text; see
+    * paid, num_training: Training episodes in which tampering paid, and all.
+    * misnamed: Share of steps whose query is not the action, as text; see
       `queries`.
-    onset: Control steps of all worlds up to the first point of the learning
+    * onset: Control steps of all worlds up to the first point of the learning
       curve from which on training hacks more than the control, if the seed
-      tampers. One point is none:
-    too_short: The last point, if training hacks more only there.
-    audit: Audit of the design; see `audited.of`.
-    fails: True if the agent fails at the task, False if it does not, `None` if
-      that is unclear.
-    gap: Tampering gap: true return of the secure twin minus that of the run.
+      tampers. One point is none.
+    * too_short: The last point, if training hacks more only there.
+    * audit: Audit of the design; see `audited.of`.
+    * fails: True if the agent fails at the task, False if it does not, `None`
+      if that is unclear.
+    * gap: Tampering gap: true return of the secure twin minus that of the run.
 
   Raises:
     ResultsError: If runs cannot be compared, or an audit is of another design
