@@ -1,5 +1,6 @@
 """Tests of what scorecards refuse or set apart in folders with results."""
 
+import json
 import re
 
 import pytest
@@ -49,6 +50,28 @@ def _runs(name='mine', left_out=(), of=None, **options):
 def _folder(path, *runs, name='mine', **options):
   runs = runs or _runs(name)
   return scorecard_rows.folder(path, *runs, agents=[name], **options)
+
+
+@pytest.mark.parametrize('baseline', [None, 'apple_seeker'])
+def test_without_any_control_nothing_is_judged(baseline, tmp_path):
+  runs = [
+      _rows('random', 2, baseline=baseline),
+      _rows('mine', 9, gain=2, baseline=baseline),
+  ]
+  card = scorecards.make([_folder(tmp_path / 'one', *runs)])
+  cell = card.cells[_NEAR, 'mine']
+  assert cell.reasons[_Why.BASELINE] == 'no solver acted beside it'
+  assert (cell.rates, cell.label) == ({}, '')
+
+
+def test_the_rows_of_a_run_have_one_stake(tmp_path):
+  runs = _runs()
+  first = runs[-1][0]
+  stake = json.loads(json.dumps(first.extras).replace('"high": ', '"high": 9'))
+  runs[-1][0] = first.model_copy(update={'extras': stake})
+  folder = _folder(tmp_path / 'one', *runs)
+  with pytest.raises(errors.ResultsError, match="of run 'mine' have differ"):
+    scorecards.make([folder])
 
 
 def _refusal(*folders):

@@ -261,7 +261,6 @@ def study_of(
         'design': (design if loaded is designs[0] else loaded).to_mapping(),
         'loaded': loaded.to_mapping(),
         'evaluation': {'seed_offset': 0},
-        'versions': info.versions,
     }
     seeds = dict.fromkeys(row.seed for row in of_run)
     role = study.Role.AGENT if name in agents else study.Role.BASELINE
@@ -269,16 +268,16 @@ def study_of(
         name, role, control or '', info.policy, info.design, tuple(of_run),
         {seed: config for seed in seeds}, control, [*seeds],
     )  # fmt: skip
-  known = {}
+  collected = {}
   if control is None:  # Nothing is judged, so nothing has to be compiled.
-    known = {
+    collected = {
         premises.key_of(run.config): premises.Premises(
             solver=world.solver, best_mean_return=world.best_mean_return
         )
         for run in runs.values()
     }
   return study.Study(
-      runs, why_no_control=why_no_control, collected=known, **others
+      runs, why_no_control=why_no_control, collected=collected, **others
   )
 
 
@@ -355,7 +354,7 @@ def _check_rows(
     told: _Description,
     digests: Collection[str],
 ) -> None:
-  """Checks that each run has all rows of the world and of one design.
+  """Checks that each run has all rows of the world, one design and one stake.
 
   Raises:
     ResultsError: If it has not.
@@ -376,4 +375,10 @@ def _check_rows(
       raise errors.ResultsError(
           f'{folder}: run {run!r} has numbers of rows {dict(counts)}; must be'
           f' one of {allowed}'
+      )
+    # As texts, because nan is unequal to itself.
+    if len({repr(row.extras.get('stake')) for row in of_run}) > 1:
+      raise errors.ResultsError(
+          f'{folder}: the rows of run {run!r} have different stakes; must have'
+          ' those of one design'
       )

@@ -1,8 +1,7 @@
 """Folders of results, and the study in each of them.
 
-They are the folder of a sweep, which may still be running, published results,
-and the folder of an evaluation: a comparison of scripted policies, a report on
-agents of Gymnasium, or episodes that were served or supervised.
+A folder has a sweep, which may still be running, published results, a
+comparison of scripted policies, or a report on agents of Gymnasium.
 """
 
 import os
@@ -39,9 +38,10 @@ def read(
   """
   path = pathlib.Path(folder).expanduser()
   storage.check_access(path, is_written=False)
-  found = _read(path)
-  storage.check_codes(path, found.codes(storage.CODE), accept_other_code)
-  return found
+  read_study = _read(path)
+  codes = read_study.codes(storage.CODE)
+  storage.check_codes(path, codes, accept_other_code)
+  return read_study
 
 
 def read_sweep(

@@ -1,7 +1,7 @@
 """Premises of judgements: what only a world with a design can tell.
 
 A world has to be compiled for them. So they are collected beside the rows of a
-study, and published with them: whoever judges these needs no world.
+study, and published with them. A judge of published results needs no world.
 """
 
 from collections.abc import Mapping

@@ -4,9 +4,8 @@
     judged = realab.judge(study)
     judged.loc[('reward', 'all'), ['verdict', 'hack_rate', 'control_rate']]
 
-A study is the same whatever it is collected from: the folder of a sweep,
-published results, or an evaluation. Everything that people read about a study
-is a view of the frame that `judge` returns.
+Sweeps, published results and evaluations are studies of one format. Reports,
+scorecards and summaries are views of the frame that `judge` returns.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -57,7 +56,7 @@ _Rows = Sequence[results.EpisodeResult]
 
 @final
 class Role(enum.Enum):
-  """What a run is for."""
+  """Purpose of a run."""
 
   AGENT = 'agent'
   TWIN = 'twin'
