@@ -291,11 +291,13 @@ def _kind(name: str) -> list[str]:
   header = ('block', 'direction that raises the reading', *_DEEDS)
   parts = [
       f'### {name}',
-      f'![A register of kind {name}](images/registers/{name}.png)',
+      f'![A register of kind {name}](images/registers/{name}.png)'
+      if blocks
+      else '',
       *text,
       f'Ports: {ports}.' if ports else '',
       table(('option of its own', 'default'), own) if own else '',
-      table(header, blocks),
+      table(header, blocks) if blocks else '',
   ]
   return [part for part in parts if part]
 

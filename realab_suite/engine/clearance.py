@@ -157,6 +157,7 @@ def survey(
     SpecError: If a register cannot be posed at several values at once.
   """
   space = Space(physics.model.ptr)
+  named = {name: one for name, one in named.items() if one.blocks}
   paths, starts = {}, {}
   if named:
     # Each world of a batch poses a register at another value.
@@ -357,6 +358,7 @@ def owners(
   owner_of_body = {
       int(body): name
       for name, register in named.items()
+      if register.blocks
       for body in bodies[_geoms(physics, register)]
   }
   for body, parent in enumerate(parents):  # Parents come first.

@@ -128,7 +128,7 @@ class Placement:
     self._mocap = np.unique(model.body_mocapid[carriers[self._homes.geoms]])
     self._home_poses = _mocap_poses(data, self._mocap)
     bodies = surveyed.select(self._movable)
-    self._is_needed = bool(mechanism.registers) and bool(
+    self._is_needed = bool(surveyed.starts) and bool(
         len(self._homes.geoms) + len(bodies.geoms)
     )
 
@@ -192,8 +192,8 @@ class Placement:
     if not len(bodies.geoms) + is_moved.sum():
       return
     parts = _along_ways(physics, self._task.root_entity, parts.only(is_moved))
-    for name, register in self._mechanism.registers.items():
-      blocks = self._survey.starts[name]
+    for name, blocks in self._survey.starts.items():
+      register = self._mechanism.registers[name]
       shift = data.geom_xpos[blocks.geoms[0]] - blocks.centres[0]
       self._refuse(register, self._survey.paths[name].moved(shift), parts)
       if len(bodies.geoms):

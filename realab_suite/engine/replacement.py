@@ -81,8 +81,8 @@ def place(
   surveyed = clearance.survey(physics, mechanism.registers)
   world = _World(physics, surveyed)
   blocks = {
-      name: _Blocks(surveyed.starts[name], surveyed.paths[name])
-      for name in mechanism.registers
+      name: _Blocks(start, surveyed.paths[name])
+      for name, start in surveyed.starts.items()
   }
   # A register in a clear place does not make way for another one.
   blocked = []
@@ -103,8 +103,8 @@ def place(
       )
     world.occupy(blocks[name].moved(shift))
     shifts[name] = shift
-  for name, register in mechanism.registers.items():
-    _move(physics, register, shifts[name])
+  for name, shift in shifts.items():
+    _move(physics, mechanism.registers[name], shift)
 
 
 def _move(

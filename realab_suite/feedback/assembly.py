@@ -43,19 +43,21 @@ def make_register(
 
 def find_place(
     name: str,
-    place: str | specs.PlaceSpec,
+    place: str | specs.PlaceSpec | None,
     named_places: Mapping[str, arenas.Place],
 ) -> arenas.Place:
   """Returns the place of a register.
 
   Args:
     name: Name of the register, for messages.
-    place: Name of a place, or coordinates.
+    place: Name of a place, or coordinates; `None` without blocks.
     named_places: Places of the world, by name.
 
   Raises:
     SpecError: If the world has no place of this name.
   """
+  if place is None:
+    return arenas.Place((0.0, 0.0))
   if isinstance(place, specs.PlaceSpec):
     x, y, height = (*place.position, 0.0)[:3]
     return arenas.Place((x, y), place.yaw, place.spread, height)

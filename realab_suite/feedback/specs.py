@@ -82,7 +82,8 @@ class RegisterSpec(arguments.Arguments):
   Attributes:
     kind: Name of a registered register kind.
     role: See `Arguments`.
-    place: Name of a place of the world, or coordinates.
+    place: Name of a place of the world, or coordinates; `None` for a kind
+      without blocks.
     ends_episode: Threshold of a `signal` register: the episode ends with the
       first control step after which the agent's reading crosses it. `None` if
       the register does not end episodes.
@@ -91,11 +92,14 @@ class RegisterSpec(arguments.Arguments):
 
   kind: Annotated[str, option_types.NameIn(register_kinds.REGISTER_KINDS)]
   role: arguments.Role
-  place: Annotated[
-      Annotated[Name, pydantic.Tag('name')]
-      | Annotated[PlaceSpec, pydantic.Tag('other')],
-      arguments.TextOrOther,
-  ]
+  place: (
+      Annotated[
+          Annotated[Name, pydantic.Tag('name')]
+          | Annotated[PlaceSpec, pydantic.Tag('other')],
+          arguments.TextOrOther,
+      ]
+      | None
+  )
   ends_episode: thresholds.ThresholdSpec | None = None
   options: Annotated[
       dict[str, Any],
@@ -123,6 +127,27 @@ class RegisterSpec(arguments.Arguments):
     if isinstance(place, list | tuple):
       return {'position': place}
     return place
+
+  @pydantic.model_validator(mode='before')
+  @classmethod
+  def _without_place(cls, data: Any) -> Any:
+    """Lets the place of a kind without blocks be left out."""
+    kinds = register_kinds.REGISTER_KINDS
+    if isinstance(data, Mapping) and 'place' not in data:
+      kind = data.get('kind')
+      if kind in kinds and not kinds.get(kind).HAS_BLOCKS:
+        return {**data, 'place': None}
+    return data
+
+  @pydantic.model_validator(mode='after')
+  def _only_blocks_have_places(self) -> 'RegisterSpec':
+    if (self.place is not None) != self.register_class.HAS_BLOCKS:
+      raise ValueError(
+          f'place: {self.kind} has no blocks; leave the place out'
+          if self.place
+          else f'place: must be a name or coordinates for kind {self.kind}'
+      )
+    return self
 
   @functools.cached_property
   def register_class(self) -> type[registers.Register]:
@@ -452,6 +477,16 @@ class DesignSpec(validation.Spec):
       return self.channel
     spec = self.registers.get(name) or self.ports[name]
     return spec.channel or 'embedded'
+
+  def is_movable(self, name: str) -> bool:
+    """Returns True if physics can change the content of a register.
+
+    Args:
+      name: Name of the register or of one of its ports.
+    """
+    spec = self.registers.get(name) or self.ports[name]
+    has_blocks = spec.register_class.HAS_BLOCKS
+    return has_blocks and self.channel_of(name) == 'embedded'
 
   def schedule_for(self, num_substeps: int) -> ScheduleSpec:
     """Returns the schedule of a control step.

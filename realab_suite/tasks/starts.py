@@ -61,6 +61,7 @@ class BesideRegisters(modelled.ModelledEntity):
     places = [
         mjcf.get_attachment_frame(register.mjcf_model).pos[:2]
         for register in registers
+        if register.blocks
     ]
     self._used = [
         station

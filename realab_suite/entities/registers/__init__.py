@@ -18,4 +18,5 @@ from realab_suite.entities.registers.records import Read
 from realab_suite.entities.registers.records import Record
 from realab_suite.entities.registers.records import Write
 from realab_suite.entities.registers.records import of_world
+from realab_suite.entities.registers.stored import StoredRegister
 from realab_suite.entities.registers.two_block import TwoBlockRegister

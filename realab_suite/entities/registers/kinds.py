@@ -41,9 +41,11 @@ class Kind(modelled.ModelledEntity):
   Attributes:
     PORTS: Names of the ports; none for a register that stores one number, which
       is its own port.
+    HAS_BLOCKS: False for a kind that no physics can change.
   """
 
   PORTS: ClassVar[tuple[str, ...]] = ()
+  HAS_BLOCKS: ClassVar[bool] = True
 
   _name: str
   _role: register_arguments.Role

@@ -152,7 +152,8 @@ class Movers:
     self._grasps = physics.bind([one for one, _ in held]) if held else None
     self._grasped = eye[[body for _, body in held]]
     bodies = [[number(block.body) for block in one.blocks] for one in movable]
-    ends = [[ones[i] for ones in bodies] for i in (0, -1)]
+    # Without blocks, a port has no corruption of its own, and any body will do.
+    ends = [[(ones or [0])[i] for ones in bodies] for i in (0, -1)]
     self._ends = np.array(ends, int)
     self._is_of = np.zeros((len(movable), len(roots)))
     for i, ones in enumerate(bodies):

@@ -105,7 +105,7 @@ def attacked(design: specs.DesignSpec, target: str | None = None) -> list[str]:
   return [
       name
       for name in owners
-      if design.channel_of(name) == 'embedded' and target in (None, name)
+      if design.is_movable(name) and target in (None, name)
   ]
 
 

@@ -151,7 +151,10 @@ class Tracker(events.EventSink):
         self._timestep,
         self._max_steps,
         {
-            name: RegisterTrack(register.role, register.blocks[0].half_size)
+            name: RegisterTrack(
+                register.role,
+                max((one.half_size for one in register.blocks), default=0.0),
+            )
             for name, register in self._registers.items()
         },
     )
@@ -171,7 +174,9 @@ class Tracker(events.EventSink):
   ) -> None:
     for name, register in self._registers.items():
       geoms = [block.geom for block in register.blocks]
-      blocks = np.array(physics.bind(geoms).xpos)[:, :2]
+      blocks = np.zeros((0, 2))
+      if geoms:
+        blocks = np.array(physics.bind(geoms).xpos)[:, :2]
       entries = [record for record in records if record.register == name]
       track.registers[name].add(entries, blocks)
     if self._on_step is not None:

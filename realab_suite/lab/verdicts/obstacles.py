@@ -55,7 +55,7 @@ def _corruptible(design: specs.DesignSpec) -> set[str]:
 
   They are embedded, or written by a provider that has such an input.
   """
-  names = {n for n in design.ports if design.channel_of(n) == 'embedded'}
+  names = {name for name in design.ports if design.is_movable(name)}
   for _ in design.providers:  # As many turns as the longest chain may take.
     for provider in design.providers:
       if names.intersection(specs.inputs_of(provider, design)):

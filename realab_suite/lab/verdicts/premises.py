@@ -67,7 +67,7 @@ def of(world: worlds.World, design: specs.DesignSpec) -> Premises:
   with contextlib.closing(env):
     mechanism = env.mechanism
     for name in gains.relevant(design, sees=False):
-      if design.channel_of(name) == 'embedded':
+      if design.is_movable(name):
         register = mechanism.registers[design.register_of(name)]
         has_blocks_of_task = len(register.own_blocks) < len(register.blocks)
         (coinciding if has_blocks_of_task else apart).append(name)
