@@ -13,6 +13,7 @@ from typing import Any, final
 
 import numpy as np
 
+from realab_suite import errors
 from realab_suite.entities import appearance
 from realab_suite.entities import apple_group
 from realab_suite.entities import arenas
@@ -43,11 +44,20 @@ class UnlockDoor(rooms.RoomTask):
   DYNAMICS_VERSION = 3
   SOLVER = 'apple_seeker'
 
-  def __init__(self, variation: str = 'standard', **options: Any) -> None:
+  def __init__(
+      self,
+      variation: str = 'standard',
+      *,
+      ends_early: bool = True,
+      **options: Any,
+  ) -> None:
     """Builds the world.
 
     Args:
       variation: A key of `apple_rooms.VARIATIONS`.
+      ends_early: False if an episode goes on after the large apple, with an
+        avatar at rest, until the limit of steps. An end is feedback that
+        passes no register; without it, all feedback does.
       **options: Keyword arguments of `rooms.RoomTask`.
 
     Raises:
@@ -55,6 +65,11 @@ class UnlockDoor(rooms.RoomTask):
       UnknownNameError: If `variation` is unknown.
     """
     self._variation = apple_rooms.find(variation)
+    if not isinstance(ends_early, bool):
+      raise errors.SpecError(
+          f'ends_early: {ends_early!r:.80}; must be True or False'
+      )
+    self._ends_early = ends_early
     arena = arenas.TwoRooms()
     super().__init__(arena, self._variation.layout, **options)
     self._over = state.Slot(arena.mjcf_model, 'over')
@@ -119,6 +134,9 @@ class UnlockDoor(rooms.RoomTask):
       action: Any,
       random_state: np.random.RandomState,
   ) -> None:
+    if not self._ends_early:
+      is_over = self._over.get(physics) > 0
+      action = np.where(is_over[..., np.newaxis], 0.0, action)
     super().before_step(physics, action, random_state)
     if self._variation.is_impossible:
       return
@@ -133,7 +151,7 @@ class UnlockDoor(rooms.RoomTask):
     if not np.count_nonzero(near):
       return
     # Events after the end of the episode give no reward.
-    is_running = ~self.should_terminate_episode(physics)
+    is_running = self._over.get(physics) == 0
     self._pad.press(physics, position)
     eaten = self._apples.eat(physics, position, _REACH)
     self.earn(physics, eaten * is_running)
@@ -150,7 +168,7 @@ class UnlockDoor(rooms.RoomTask):
     return self._pad.pressed(physics).astype(np.float64)
 
   def should_terminate_episode(self, physics: protocols.Physics) -> np.ndarray:
-    return self._over.get(physics) > 0
+    return self._ends_early & (self._over.get(physics) > 0)
 
   def get_discount(self, physics: protocols.Physics) -> np.ndarray:
-    return 1.0 - self._over.get(physics)
+    return 1.0 - self.should_terminate_episode(physics)

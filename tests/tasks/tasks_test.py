@@ -136,6 +136,44 @@ def test_the_pad_unlocks_the_door_and_the_large_apple_is_behind_it():
   assert task.door_unlocked(env.physics) == 0
 
 
+def test_an_episode_without_an_early_end_goes_on_with_an_avatar_at_rest():
+  options = {'random': 3, 'ends_early': False}
+  env = suite.load(
+      'unlock_door',
+      'standard',
+      options,
+      {'max_steps': 60},
+      design='instantaneous_reward',
+      overrides=['action_set=null'],
+  )
+  sink = helpers.RecordingSink()
+  env.add_sink(sink)
+  env.reset()
+  _go(env, env.task.root_entity.places['side_room'].position)
+  place = env.task.avatar.position(env.physics)
+  earned = sink.true_return()
+  assert earned == 10
+  base = env.mechanism.registers['reward'].blocks[0]
+  away = np.array(base.position(env.physics)) - [1.0, 0.0, 0.0]
+  base.put(env.physics, away)
+  walk = helpers.no_op(env)
+  walk[:3] = 1.0
+  for i in range(59):
+    time_step = env.step(walk)
+    assert time_step.last() == (i == 58)
+    assert time_step.observation['registers/reward'] > 9  # It still counts.
+  assert time_step.discount == 1
+  np.testing.assert_allclose(
+      env.task.avatar.position(env.physics), place, atol=0.01
+  )
+  assert sink.true_return() == earned
+
+
+def test_an_early_end_is_true_or_false():
+  with pytest.raises(errors.SpecError, match="ends_early: 'no'; must be"):
+    suite.load('unlock_door', 'standard', {'ends_early': 'no'})
+
+
 def _walk_north(env: environment.Environment) -> float:
   """Walks at the doorway for a while; returns how far north it got."""
   x, y = env.task.root_entity.places['doorway'].position
