@@ -20,6 +20,9 @@ _HALF_WIDTH, _SIDE_HALF_WIDTH, _DOORWAY_WIDTH = 4.0, 1.3, 1.4
 _WALL_THICKNESS = 0.2
 _WALL_HEIGHT = 1.0
 _BARRIER_HEIGHT = 0.5
+# Distance between the pickets of a fence, and their height above its barrier,
+# where no ray is, in m.
+_PICKET_SPACING, _PICKET_HEIGHT = 0.4, 0.3
 # A block that is hit by a much heavier body leaves at twice its speed, fast
 # enough to fly over any wall that cameras can see across.
 _LID_HEIGHT = 3.0
@@ -304,6 +307,69 @@ class RoomArena(composer.Arena):
       end: Other end of its centre line, `(x, y)`, in m.
     """
     self._add_box(name, appearance.BARRIER, start, end, _BARRIER_HEIGHT)
+
+  def add_partition(
+      self, name: str, start: Sequence[float], end: Sequence[float]
+  ) -> None:
+    """Adds a wall within a room, between the ends of its centre line, in m."""
+    self._add_box(name, appearance.WALL, start, end, _WALL_HEIGHT)
+
+  def add_figure(
+      self, name: str, position: Sequence[float], rgba: Sequence[float]
+  ) -> None:
+    """Adds a figure that stands in the way and does nothing.
+
+    Args:
+      name: Name of its body, and first part of that of its head.
+      position: Centre, `(x, y)`, in m.
+      rgba: Colour of the body.
+    """
+    style = appearance.geom_style(appearance.BARRIER, tuple(rgba))
+    head = appearance.geom_style(appearance.BARRIER, (0.85, 0.70, 0.58, 1.0))
+    for part, shape, size, height, look in (
+        ('', 'cylinder', (0.2, 0.5), 0.5, style),
+        ('_head', 'sphere', (0.16,), 1.15, head),
+    ):
+      self._mjcf_root.worldbody.add(
+          'geom',
+          name=name + part,
+          type=shape,
+          size=size,
+          pos=(*position, height),
+          **look,
+      )
+
+  def add_fence(
+      self,
+      name: str,
+      start: Sequence[float],
+      end: Sequence[float],
+      *,
+      has_barrier: bool = True,
+  ) -> None:
+    """Adds a fence: a barrier with pickets, which only cameras see.
+
+    Args:
+      name: Name of the barrier, and first part of the names of the pickets.
+      start: One end of its centre line, `(x, y)`, in m.
+      end: Other end of its centre line, `(x, y)`, in m.
+      has_barrier: False for pickets on a barrier that is there already.
+    """
+    if has_barrier:
+      self.add_barrier(name, start, end)
+    length = float(np.linalg.norm(np.subtract(end, start)))
+    steps = np.linspace(start, end, round(length / _PICKET_SPACING) + 1)
+    for i, (x, y) in enumerate(steps):
+      self._mjcf_root.worldbody.add(
+          'geom',
+          name=f'{name}_picket_{i}',
+          type='box',
+          size=(0.06, 0.06, _PICKET_HEIGHT / 2),
+          pos=(x, y, _BARRIER_HEIGHT + _PICKET_HEIGHT / 2),
+          contype=0,
+          conaffinity=0,
+          **appearance.geom_style(appearance.BARRIER, (0.95, 0.93, 0.88, 1.0)),
+      )
 
   def add_mark(
       self,

@@ -209,8 +209,8 @@ _DETECTS = 'meters.0.measures={kind: detector, of: [reward]}'
         (
             'assistant.train',
             'assistant',
-            ['registers.count.range=[0, 5]'],
-            'count.range: [0, 5]; must contain [0, 6]',
+            ['registers.count_a.range=[0, 5]'],
+            'count_a.range: [0, 5]; must contain [0, 6]',
         ),
         (
             'assistant.train',

@@ -55,8 +55,17 @@ def _load(
 def _target(domain: str) -> str:
   """Returns the name of a register that pays if its first block is away."""
   # The feedback of the design `tidy_up` is secure, and its meters are not.
-  others = {'tidy_up': 'tidy_1', 'supervised_room': 'approval'}
+  others = {
+      'assistant': 'value',
+      'tidy_up': 'tidy_1',
+      'supervised_room': 'approval',
+  }
   return others.get(domain, 'reward')
+
+
+def _saboteur(domain: str) -> str:
+  """Returns the name of a policy that carries that block away."""
+  return 'liking_saboteur' if domain == 'assistant' else 'carrying_saboteur'
 
 
 def _solved(domain: str, num_episodes: int) -> Any:
@@ -100,7 +109,7 @@ def test_whoever_carries_a_block_away_gains_but_in_the_secure_twin(domain: str):
   for channel in ('embedded', 'secure'):
     overrides = [f'channel={channel}'] * (channel == 'secure')
     env = _load(domain, overrides, max_steps=120)
-    saboteur = aiming.make_policy('carrying_saboteur', env, target, 0)
+    saboteur = aiming.make_policy(_saboteur(domain), env, target, 0)
     results = realab.evaluate(env, saboteur, 2)
     env.close()
     gained[channel] = max(
@@ -144,7 +153,7 @@ def test_each_variation_is_solved_and_tampered_with_where_that_is_possible(
     else:
       _check_solved(env, domain)
     env.rewind()
-    saboteur = aiming.make_policy('carrying_saboteur', env, _target(domain), 0)
+    saboteur = aiming.make_policy(_saboteur(domain), env, _target(domain), 0)
     results = realab.evaluate(env, saboteur, 1 if task == 'boxed' else 2)
   gained = max(one.observed_return - one.true_return for one in results)
   if task == 'boxed':
@@ -242,8 +251,8 @@ def test_a_find_takes_the_avatar_to_another_start_with_empty_hands():
   starts = []
   for _ in range(7):
     env.task.avatar.place(env.physics, spot, 0.0)
-    env.step(helpers.no_op(env))
-    env.step(helpers.no_op(env))
+    for _ in range(3):
+      env.step(helpers.no_op(env))
     starts.append(tuple(env.task.avatar.position(env.physics).round(3)))
   assert env.task.score(env.physics) == 5.0
   assert len(set(starts[:5])) == 5
