@@ -23,6 +23,7 @@ _BARRIER_HEIGHT = 0.5
 # Distance between the pickets of a fence, and their height above its barrier,
 # where no ray is, in m.
 _PICKET_SPACING, _PICKET_HEIGHT = 0.4, 0.3
+_PALE_WOOD = 0.86, 0.80, 0.68, 1.0
 # A block that is hit by a much heavier body leaves at twice its speed, fast
 # enough to fly over any wall that cameras can see across.
 _LID_HEIGHT = 3.0
@@ -297,7 +298,11 @@ class RoomArena(composer.Arena):
     self._places.update(places)
 
   def add_barrier(
-      self, name: str, start: Sequence[float], end: Sequence[float]
+      self,
+      name: str,
+      start: Sequence[float],
+      end: Sequence[float],
+      rgba: Sequence[float] | None = None,
   ) -> None:
     """Adds a barrier: a wall so low that cameras see across it.
 
@@ -305,8 +310,9 @@ class RoomArena(composer.Arena):
       name: Name of the geom.
       start: One end of its centre line, `(x, y)`, in m.
       end: Other end of its centre line, `(x, y)`, in m.
+      rgba: Colour; `None` for that of barriers.
     """
-    self._add_box(name, appearance.BARRIER, start, end, _BARRIER_HEIGHT)
+    self._add_box(name, appearance.BARRIER, start, end, _BARRIER_HEIGHT, rgba)
 
   def add_partition(
       self, name: str, start: Sequence[float], end: Sequence[float]
@@ -356,7 +362,7 @@ class RoomArena(composer.Arena):
       has_barrier: False for pickets on a barrier that is there already.
     """
     if has_barrier:
-      self.add_barrier(name, start, end)
+      self.add_barrier(name, start, end, _PALE_WOOD)
     length = float(np.linalg.norm(np.subtract(end, start)))
     steps = np.linspace(start, end, round(length / _PICKET_SPACING) + 1)
     for i, (x, y) in enumerate(steps):
@@ -368,7 +374,7 @@ class RoomArena(composer.Arena):
           pos=(x, y, _BARRIER_HEIGHT + _PICKET_HEIGHT / 2),
           contype=0,
           conaffinity=0,
-          **appearance.geom_style(appearance.BARRIER, (0.95, 0.93, 0.88, 1.0)),
+          **appearance.geom_style(appearance.BARRIER, _PALE_WOOD),
       )
 
   def add_mark(
@@ -412,10 +418,11 @@ class RoomArena(composer.Arena):
       start: Sequence[float],
       end: Sequence[float],
       height: float,
+      rgba: Sequence[float] | None = None,
   ) -> mjcf.Element:
     line = np.array([start, end], float)
     half = np.ptp(line, axis=0) / 2 + _WALL_THICKNESS / 2
-    colour = (*self._look.walls, 1.0) if kind == appearance.WALL else None
+    colour = (*self._look.walls, 1.0) if kind == appearance.WALL else rgba
     return self._mjcf_root.worldbody.add(
         'geom',
         name=name,

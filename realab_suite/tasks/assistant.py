@@ -89,7 +89,7 @@ class Assistant(valued_things.ValuedThings):
     worths = worth, worth[::-1]
     super().__init__(_LOOK, _NUMBERS, worths, _HALL, **options)
     arena = self.root_entity
-    arena.add_barrier('counter', *_COUNTER)
+    arena.add_barrier('counter', *_COUNTER, rgba=(0.42, 0.30, 0.20, 1.0))
     arena.add_figure('user', _USER, (0.25, 0.35, 0.55, 1.0))
     for i, wall in enumerate(_ALCOVES):
       arena.add_partition(f'alcove_{i}', *wall)
