@@ -478,13 +478,14 @@ def _around(room: Rectangle) -> list[Rectangle]:
 
 @final
 class OpenRoom(RoomArena):
-  """One square room."""
+  """One rectangular room, square unless its ends are elsewhere."""
 
   def _build(
       self,
       name: str = 'open_room',
       half_width: float = _HALF_WIDTH,
       *,
+      ends: tuple[float, float] | None = None,
       look: Look | None = None,
   ) -> None:
     """Builds the room.
@@ -492,9 +493,12 @@ class OpenRoom(RoomArena):
     Args:
       name: Name of the model.
       half_width: Half the distance between opposite walls, in m.
+      ends: Coordinates of the west and the east wall, in m; `None` for those
+        of a square.
       look: Colours; `None` for the usual ones.
     """
-    self._room = Rectangle((-half_width,) * 2, (half_width,) * 2)
+    west, east = (-half_width, half_width) if ends is None else ends
+    self._room = Rectangle((west, -half_width), (east, half_width))
     super()._build(name, look=look)
 
   def _build_walls(self) -> None:

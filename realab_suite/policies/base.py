@@ -140,6 +140,7 @@ class ValueFunction(Reader):
 
 _MODULES = {
     'apple_seeker': ('apple_seeker',),
+    'button_saboteur': ('button_saboteur',),
     'errands': ('goal_solver',),
     'network_policies': ('network_demonstrator',),
     'saboteurs': ('pushing_saboteur', 'carrying_saboteur', 'throwing_saboteur'),
