@@ -100,6 +100,13 @@ def test_the_gain_stands_beside_that_of_the_solver():
   assert difference.startswith('0.6 [')
 
 
+def test_a_rounding_error_is_no_gain():
+  agent = scorecard_rows.rows('a', {0: [1] * 4, 1: [1] * 4}, gain=-1e-14)
+  solver = scorecard_rows.rows('s', {0: [1] * 4, 1: [1] * 4}, gain=4)
+  found = verdicts.coincidence(agent, solver, _STAKE, ())
+  assert found.reason.startswith('relative gain 0 (all 2 seeds), the solver')
+
+
 @pytest.mark.parametrize(
     ('solver', 'agent', 'coincides'),
     [

@@ -171,7 +171,7 @@ def test_a_folder_counts_once(tmp_path):
   )
   assert 'given twice' in complaint
   missing = in_process.complaint(scorecard, f'--input={tmp_path / "no"}')
-  assert 'no: not a sweep, and without rows' in missing
+  assert 'no: there is no such folder; must be a folder of' in missing
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,13 @@
 """Tests of studies and of their judge, which needs neither files nor worlds."""
 
+import dataclasses
 import math
 from unittest import mock
 
 import pytest
 
 import realab_suite as realab
+from realab_suite import errors
 from realab_suite import worlds
 from realab_suite.lab.verdicts import study
 from realab_suite.lab.verdicts import verdicts
@@ -61,6 +63,50 @@ def test_a_judge_returns_a_line_for_each_run_and_seed():
   assert set(study.seeds(judged, 'mine')['verdict']) == {'tampers'}
   assert judged.loc['random', study.ALL]['label'] is verdicts.Label.CONTROL
   assert (judged['label'] == 'tampers').sum() == 3
+
+
+_FAR = _rows('mine', task='far')
+
+
+@pytest.mark.parametrize(
+    ('changes', 'problem'),
+    [
+        ({'rows': _rows('mine') + _rows('mine', 9.0)[:1]},
+         "run 'mine', (seed, world, episode) (0, 0, 0): has two rows; must"),
+        ({'rows': [*_rows('mine')[:20], *_FAR[20:]]},
+         "run 'mine', (seed, world, episode) (1, 0, 0): a row of"
+         ' unlock_door.far; must be one of unlock_door.near'),
+        ({'configs': {}}, "run 'mine', (seed, world, episode) (0, 0, 0): a row"
+         ' without a configuration; must have a seed of []'),
+        ({'configs': {0: {'task': 'unlock_door.near'}}},
+         "run 'mine', seed 0: its configuration has ['task']; must have"
+         " ['design', 'task_kwargs', 'environment_kwargs', 'max_steps',"
+         " 'evaluation'] as well"),
+        ({'name': 'other'}, "run 'other' is named 'mine' in its study"),
+    ],
+)  # fmt: skip
+def test_a_study_that_cannot_be_judged_is_refused(changes, problem):
+  found = _study(mine=_rows('mine'))
+  run = dataclasses.replace(found.runs['mine'], **changes)
+  with pytest.raises(errors.ResultsError) as raised:
+    dataclasses.replace(found, runs={**found.runs, 'mine': run})
+  assert str(raised.value).startswith(problem)
+
+
+@pytest.mark.parametrize(
+    ('name', 'problem'),
+    [
+        ('file', 'file: a file; must be a folder of results'),
+        ('none', 'none: there is no such folder; must be a folder of results'),
+        ('a\0b', r'a\0b: there is no such folder; must be a folder of results'),
+        ('', 'not a sweep, and without rows or a design'),
+    ],
+)
+def test_what_is_no_folder_of_results_is_refused(name, problem, tmp_path):
+  (tmp_path / 'file').touch()
+  with pytest.raises(errors.ResultsError) as raised:
+    realab.read_study(tmp_path / name)
+  assert problem in str(raised.value)
 
 
 def test_no_agent_makes_itself_the_control_by_its_name():

@@ -5,6 +5,7 @@ import types
 
 import hypothesis
 from hypothesis import strategies as st
+import pandas as pd
 import pytest
 
 from realab_suite.lab.verdicts import hacking
@@ -20,7 +21,7 @@ _LEARNED = 3
 
 
 def _count(run, control):
-  return hacking.count(run, STAKE, control.limit)
+  return hacking.count(run, STAKE, control['limit'].iloc[0])
 
 
 def _control(*relative):
@@ -217,8 +218,7 @@ def test_a_copy_of_the_control_is_not_accused(relative):
 
 def _verdict(rates, control, labels):
   judgements = [verdicts.Judgement(label, 'fog') for label in labels]
-  counts = hacking.count_by_seed(_seeds(rates), STAKE, control.limit)
-  return verdicts.verdict(judgements, counts, control)
+  return verdicts.verdict(judgements, _count(_seeds(rates), control), control)
 
 
 @pytest.mark.parametrize(
@@ -258,7 +258,7 @@ def test_verdicts_by_hand(rates, control, labels, words):
 
 def test_a_verdict_without_hack_rates_says_what_is_missing():
   unknown = [verdicts.Judgement(_NOT, 'there is no control')] * 5
-  verdict = verdicts.verdict(unknown, {}, None)
+  verdict = verdicts.verdict(unknown, pd.DataFrame(), None)
   assert str(verdict) == 'not judged: there is no control'
 
 
