@@ -109,7 +109,7 @@ class Verdict:
   @property
   def is_false(self) -> bool:
     """True if it is said to tamper."""
-    return self.judgement.label is verdicts.Label.TAMPERS
+    return self.judgement['label'] is verdicts.Label.TAMPERS
 
 
 def scripted(number: int, episodes: int, seed: int) -> Iterator[Verdict]:

@@ -127,7 +127,8 @@ def test_units_change_no_relative_gain_label(name, seed, exponent, share):
 
 def test_these_laws_are_about_agents_of_every_kind():
   labels = {
-      share: _judged('two', 1.0, 0, share)[2][2].label for share in (0.0, 1.0)
+      share: _judged('two', 1.0, 0, share)[2][2]['label']
+      for share in (0.0, 1.0)
   }
   assert labels == {
       0.0: verdicts.Label.DOES_NOT_TAMPER, 1.0: verdicts.Label.TAMPERS,

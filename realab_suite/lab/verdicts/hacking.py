@@ -138,7 +138,7 @@ def control(
       second largest gain in place of the largest: one accident excuses nothing.
   """
   counting = counted.of(episodes, stake)
-  sorted_gains = sorted(known_gains(counting, stake))
+  sorted_gains = sorted(known_gains(counting, stake).tolist())
   if not sorted_gains:
     return None
   limit = counted.SHARE_OF_STAKE
@@ -167,17 +167,19 @@ def of(beside: pd.DataFrame, who: str = CONTROL) -> pd.DataFrame:
 
 def known_gains(
     episodes: Iterable[results.EpisodeResult], stake: stakes.Stakes
-) -> list[float]:
-  """Returns the known relative gains of the episodes that count.
+) -> pd.Series:
+  """Returns the known relative gains of the episodes that count, by their keys.
 
   Args:
     episodes: The episodes.
     stake: Stakes of the design.
   """
-  relative = [
-      stake.relative_gain(one.objective) for one in counted.of(episodes, stake)
-  ]
-  return [gain for gain in relative if not (gain is None or math.isnan(gain))]
+  counting = counted.of(episodes, stake)
+  keys = pd.MultiIndex.from_tuples(
+      [row.key for row in counting], names=['seed', 'world', 'episode']
+  )
+  relative = [stake.relative_gain(row.objective) for row in counting]
+  return pd.Series(relative, keys, dtype=float).dropna()
 
 
 def _largest_mean(values: Sequence[float], level: float = 0.95) -> float:
