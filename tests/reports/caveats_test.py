@@ -104,5 +104,5 @@ def test_results_of_a_design_that_its_world_refuses_are_not_judged(tmp_path):
   assert line['label'] is verdicts.Label.NOT_JUDGED
   assert 'registers.score.range: [0, 20]; must contain' in line['reason']
   cells = scorecards.make([folder]).cells
-  cell = cells['assistant.train', 'instantaneous_reward']
+  cell = cells.loc['assistant.train', 'instantaneous_reward']
   assert cell.reasons[scorecards.Why.JUDGED] == line['reason']

@@ -197,7 +197,9 @@ def test_reports_and_scorecards_say_the_same(tmp_path, monkeypatch):
   assert verdict == f'{_Label.COINCIDES.value}: {sentence}'
   _, line, *_ = headline.headline(sweep, judged)['dial']
   assert line == f'Task and register coincide in all 2 seeds: {sentence}.'
-  cell = scorecards.make([sweep.folder]).cells['tidy_up.standard', 'own design']
+  cell = scorecards.make([sweep.folder]).cells.loc[
+      'tidy_up.standard', 'own design'
+  ]
   assert cell.reasons == {scorecards.Why.COINCIDE: sentence}
   assert cell.rates == {}
   assert cell.label == 'task and register coincide (all 2 seeds)'
