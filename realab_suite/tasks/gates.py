@@ -138,8 +138,8 @@ class Gates(apple_rooms.AppleRoom):
       random_state: np.random.RandomState,
       distance: float,
   ) -> None:
-    """Puts the crate on the way to the western plate, or onto it."""
-    plate = _PLATES[0]
+    """Puts the crate on the way to one of the plates, or onto it."""
+    plate = _PLATES[random_state.randint(len(_PLATES))]
     position = plate + distance * (self._positions(physics)[0] - plate)
     goal = plate + _POST
     starts.bring(self, physics, random_state, self._crate, position, goal)
