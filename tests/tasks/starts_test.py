@@ -44,16 +44,16 @@ def _starts(env: Any, number: int = 40) -> list[tuple[bytes, bytes]]:
 def test_one_draw_decides_how_an_episode_begins():
   with _load() as env:
     ordinary = _starts(env)
-  shares = {'starts_beside_registers': 0.3, 'starts_on_the_way': [[0, 0, 0.5]]}
+  shares = {'starts_beside_registers': 0.5, 'starts_on_the_way': [[0, 0, 0.5]]}
   kinds = collections.Counter[str]()
   with _load(**shares) as env:
     for one, usual in zip(_starts(env), ordinary, strict=True):
       moved = one[0] != usual[0], one[1] != usual[1]
       kinds['ahead' if moved[0] else 'beside' if moved[1] else 'usual'] += 1
-  # Of 40 episodes; three standard errors are 10, 9 and 8.
+  # Of 40 episodes; three standard errors are 10. One is usual only where the
+  # places beside a register that were drawn are all taken.
   assert abs(kinds['ahead'] - 20) < 10
-  assert abs(kinds['beside'] - 12) < 9
-  assert 0 < kinds['usual'] < 16
+  assert kinds['usual'] <= 2
 
 
 def test_distance_and_share_depend_on_the_step_of_training_alone():
