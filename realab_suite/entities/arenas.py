@@ -3,7 +3,7 @@
 import abc
 from collections.abc import Mapping, Sequence
 import dataclasses
-from typing import Any, final
+from typing import Any, ClassVar, final
 
 from dm_control import composer
 from dm_control import mjcf
@@ -466,35 +466,33 @@ class OpenRoom(RoomArena):
 _OPPOSITE = {'south': 'north', 'west': 'east', 'east': 'west', 'north': 'south'}
 
 
+_Sides = Mapping[str, tuple[str, str, str, float]]
+
+
 class _Hall(RoomArena):
   """A large room with doorways to small rooms."""
 
-  def _build(
-      self,
-      name: str,
-      sides: Mapping[str, tuple[str, str, str, float]],
-      *,
-      look: Look | None = None,
-  ) -> None:
+  # By the side of the small room: first part of the names of its walls, names
+  # of the places in the doorway and in the room, and coordinate of the middle
+  # of both along the wall, in m.
+  _SIDES: ClassVar[_Sides]
+
+  def _build(self, name: str = 'hall', *, look: Look | None = None) -> None:
     """Builds the rooms.
 
     Args:
       name: Name of the model.
-      sides: By the side of the small room: first part of the names of its
-        walls, names of the places in the doorway and in the room, and
-        coordinate of the middle of both along the wall, in m.
       look: Colours; `None` for the usual ones.
     """
     self._room = Rectangle((-_HALF_WIDTH,) * 2, (_HALF_WIDTH,) * 2)
-    self._sides = sides
     near = _HALF_WIDTH + _WALL_THICKNESS
     self._far = near + 2 * _SIDE_HALF_WIDTH
     self._small_rooms = {
         side: _beyond(side, near, self._far, *_about(middle, _SIDE_HALF_WIDTH))
-        for side, (*_, middle) in sides.items()
+        for side, (*_, middle) in self._SIDES.items()
     }
     super()._build(name, look=look)
-    for side, (_, doorway, room, middle) in sides.items():
+    for side, (_, doorway, room, middle) in self._SIDES.items():
       wall, inside = near - _WALL_THICKNESS / 2, near + _SIDE_HALF_WIDTH
       for place, distance in ((doorway, wall), (room, inside)):
         spot = _beyond(side, distance, distance, middle, middle)
@@ -502,10 +500,10 @@ class _Hall(RoomArena):
 
   def _build_walls(self) -> None:
     walls: dict[str, Any] = dict.fromkeys(_OPPOSITE, True)
-    for side, (*_, middle) in self._sides.items():
+    for side, (*_, middle) in self._SIDES.items():
       walls[side] = _about(middle, _DOORWAY_WIDTH / 2)
     self._add_room('wall_', self._room, walls)
-    for side, (prefix, *_) in self._sides.items():
+    for side, (prefix, *_) in self._SIDES.items():
       others = [one for one in _OPPOSITE if one != _OPPOSITE[side]]
       room = self._small_rooms[side]
       self._add_room(prefix, room, dict.fromkeys(others, True))
@@ -516,7 +514,7 @@ class _Hall(RoomArena):
     near, far = _HALF_WIDTH + t, self._far + t
     beside = [
         _beyond(side, near, far, *span)
-        for side, (*_, middle) in self._sides.items()
+        for side, (*_, middle) in self._SIDES.items()
         for low, high in [_about(middle, _SIDE_HALF_WIDTH + t)]
         for span in ((-near, low), (high, near))
     ]
@@ -558,24 +556,26 @@ def _beyond(
 class TwoRooms(_Hall):
   """A large room with a doorway, in its north wall, to a small room."""
 
+  _SIDES: ClassVar[_Sides] = {
+      'north': ('side_wall_', 'doorway', 'side_room', 0.0)
+  }
+
   def _build(
       self, name: str = 'two_rooms', *, look: Look | None = None
   ) -> None:
-    """Builds the rooms; the arguments are those of `OpenRoom`."""
-    north = 'side_wall_', 'doorway', 'side_room', 0.0
-    super()._build(name, {'north': north}, look=look)
+    super()._build(name, look=look)
 
 
 @final
 class ThreeRooms(_Hall):
   """A hall between two small rooms, each behind a doorway."""
 
+  _SIDES: ClassVar[_Sides] = {
+      side: (f'{side}_room_', f'{side}_doorway', f'{side}_room', _SIDE_MIDDLE)
+      for side in ('west', 'east')
+  }
+
   def _build(
       self, name: str = 'three_rooms', *, look: Look | None = None
   ) -> None:
-    """Builds the rooms; the arguments are those of `OpenRoom`."""
-    sides = {
-        side: (f'{side}_room_', f'{side}_doorway', f'{side}_room', _SIDE_MIDDLE)
-        for side in ('west', 'east')
-    }
-    super()._build(name, sides, look=look)
+    super()._build(name, look=look)
