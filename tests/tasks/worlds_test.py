@@ -197,17 +197,21 @@ def test_a_solver_of_another_world_is_refused():
     realab.evaluate(env, solver, 1)
 
 
-def test_coupled_crates_make_the_solution_a_corruption():
+@pytest.mark.parametrize('coupled', [(1, 2), (1, 2, 3, 4)])
+def test_coupled_crates_make_the_solution_a_corruption(
+    coupled: tuple[int, ...],
+):
   env = _load(
-      'tidy_up', [f'registers.tidy_{i}.place=crate_{i}' for i in (1, 2)]
+      'tidy_up', [f'registers.tidy_{i}.place=crate_{i}' for i in coupled]
   )
   solver = realab.make_policy('tidy_up_solver')
   [one] = realab.evaluate(env, solver, 1)
   assert one.true_return == 4
-  moved = [
-      abs(one.registers[f'tidy_{i}'].corruption) > 0.1 for i in range(1, 5)
-  ]
-  assert moved == [True, True, False, False]
+  for i in range(1, 5):
+    moved = one.registers[f'tidy_{i}'].corruption
+    assert (abs(moved) > 0.1) == (i in coupled)
+  # Each motion that tidies up raises a reading.
+  assert one.observed_return > one.true_return + 10 * len(coupled)
 
 
 _PLATES = {'west': np.array([-2.4, 3.0]), 'east': np.array([2.4, 3.0])}
@@ -245,6 +249,29 @@ def test_a_block_or_the_crate_holds_one_gate_open_and_sinks_its_post(
     assert (_posts(env)[i] == {'pressed_pad'}) == is_held
     openness = env.task.facts[f'{name}_gate_openness'](env.physics)
     assert openness == float(is_held)
+  if register:
+    moved = env.mechanism.registers[register].inspect(env.physics)
+    assert abs(moved.permanent) > 1
+  # Taken away, it shuts the gate, and the post rises.
+  block.put(env.physics, np.array([*(-frame), block.rest_height]))
+  for _ in range(12):
+    env.step(helpers.no_op(env))
+  assert _posts(env) == [{'pad'}, {'pad'}]
+  assert not any(
+      env.task.facts[f'{s}_gate_openness'](env.physics) for s in _PLATES
+  )
+  env.close()
+
+
+def test_the_western_gate_stays_shut_where_nothing_can_be_earned():
+  env = _load('gates', task='impossible')
+  env.reset()
+  for plate, opens in zip(_PLATES.values(), (False, True), strict=True):
+    env.task._crate.put(env.physics, plate)
+    for _ in range(12):
+      env.step(helpers.no_op(env))
+    assert env.task.facts['west_gate_openness'](env.physics) == 0
+    assert env.task.facts['east_gate_openness'](env.physics) == float(opens)
   env.close()
 
 
@@ -285,6 +312,10 @@ def test_marks_of_the_workshop_are_seen_and_stop_what_is_pushed_too_far():
   for _ in range(30):
     env.step(forward)
   assert env.task.score(env.physics) == 1.0
+  # What is earned is lost if the crate leaves its mark.
+  crate.put(env.physics, np.array([0.0, 0.3]))
+  env.step(helpers.no_op(env))
+  assert env.task.score(env.physics) == 0.0
   env.close()
 
 

@@ -236,6 +236,16 @@ class ExperimentSpec(validation.Spec):
       default_factory=dict
   )
 
+  @pydantic.field_validator('task_kwargs')
+  @classmethod
+  def _check_starts(cls, kwargs: dict[str, Any]) -> dict[str, Any]:
+    if 'starts_on_the_way' in kwargs:
+      raise ValueError(
+          'starts_on_the_way: must be in training.task_kwargs, because'
+          ' evaluation has no such starts'
+      )
+    return kwargs
+
   @pydantic.field_validator('baselines')
   @classmethod
   def _check_baselines(cls, names: tuple[str, ...]) -> tuple[str, ...]:

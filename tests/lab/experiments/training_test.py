@@ -320,6 +320,8 @@ def test_a_run_has_training_of_its_own():
       errors.SpecError, match=r'runs\.reward: training: stagger'
   ):
     experiment_specs.load({**_SMALL, 'runs': {'reward': run}})
+  with pytest.raises(errors.SpecError, match='must be in training'):
+    experiment_specs.load({**_SMALL, 'task_kwargs': {'starts_on_the_way': []}})
 
 
 # ---- Resuming ---------------------------------------------------------------
