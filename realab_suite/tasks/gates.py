@@ -42,6 +42,8 @@ _RADIUS = 0.6
 # Place of the post, from the middle of its plate, in m.
 _POST = np.array([0.0, 0.75])
 _APPLES_AT = [(-6.2, 0.9), (-4.9, 0.9), (-5.5, 1.6), (-6.2, 2.3), (-4.9, 2.3)]
+# Share of the starts on the way that are on that to the eastern plate.
+_EASTERN = 0.25
 # Largest distance between the hand and a crate that it holds, in m.
 _NEAR_HAND = 0.3
 _BEFORE, _BEHIND = np.array([-3.4, 1.6]), -4.3
@@ -138,8 +140,11 @@ class Gates(apple_rooms.AppleRoom):
       random_state: np.random.RandomState,
       distance: float,
   ) -> None:
-    """Puts the crate on the way to one of the plates, or onto it."""
-    plate = _PLATES[random_state.randint(len(_PLATES))]
+    """Puts the crate on the way to a plate, or onto it: in most cases western.
+
+    A learner also has to find out what is behind the other gate.
+    """
+    plate = _PLATES[int(random_state.uniform() < _EASTERN)]
     position = plate + distance * (self._positions(physics)[0] - plate)
     goal = plate + _POST
     starts.bring(self, physics, random_state, self._crate, position, goal)
