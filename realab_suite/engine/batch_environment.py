@@ -174,6 +174,21 @@ class BatchEnvironment:
     self._episodes = np.where(is_first, -1, self._episodes)
     self._is_pending = np.ones(self._num_envs, bool)
 
+  def abandon(self, worlds: Sequence[int]) -> None:
+    """Abandons the current episodes of worlds; `step` begins the next ones.
+
+    Args:
+      worlds: Indices of the worlds.
+
+    Raises:
+      SpecError: If there is no such world.
+    """
+    self._refuse_if_unusable()
+    indices = arguments.indices(worlds, self._num_envs)
+    is_abandoned = np.isin(np.arange(self._num_envs), indices)
+    self._end_episodes(is_abandoned, events.End.ABANDONED)
+    self._is_pending = self._is_pending | is_abandoned
+
   def action_spec(self) -> specs.Array:
     """Returns the spec of one action; `step` takes `(worlds, *spec.shape)`."""
     return self._single.action_spec()

@@ -3,7 +3,7 @@
 import abc
 from collections.abc import Mapping, Sequence
 import dataclasses
-from typing import Any, final
+from typing import Any, ClassVar, final
 
 from dm_control import composer
 from dm_control import mjcf
@@ -17,9 +17,12 @@ from realab_suite.entities import surroundings
 # Half the sides of a large and of a small room, and the width of the opening
 # between them, in m.
 _HALF_WIDTH, _SIDE_HALF_WIDTH, _DOORWAY_WIDTH = 4.0, 1.3, 1.4
+# Coordinate of the middle of the rooms beside a hall, in m.
+_SIDE_MIDDLE = 1.6
 _WALL_THICKNESS = 0.2
 _WALL_HEIGHT = 1.0
 _BARRIER_HEIGHT = 0.5
+_POST_RADIUS = 0.12
 # Distance between the pickets of a fence, and their height above its barrier,
 # where no ray is, in m.
 _PICKET_SPACING, _PICKET_HEIGHT = 0.4, 0.3
@@ -403,6 +406,23 @@ class RoomArena(composer.Arena):
         **appearance.geom_style(kind),
     )
 
+  def add_post(self, name: str, kind: str, position: Sequence[float]) -> None:
+    """Adds a solid post, which rays see from far away, unlike a mark.
+
+    Args:
+      name: Name of the geom.
+      kind: Class that rays report, with a colour.
+      position: Position, `(x, y)`, in m.
+    """
+    self._mjcf_root.worldbody.add(
+        'geom',
+        name=name,
+        type='cylinder',
+        size=(_POST_RADIUS, (_BARRIER_HEIGHT + _DEPTH) / 2),
+        pos=(*position, (_BARRIER_HEIGHT - _DEPTH) / 2),
+        **appearance.geom_style(kind),
+    )
+
   def _add_wall(
       self, name: str, start: Sequence[float], end: Sequence[float]
   ) -> None:
@@ -520,13 +540,21 @@ class OpenRoom(RoomArena):
     return self._room
 
 
-@final
-class TwoRooms(RoomArena):
-  """A large room with a doorway, in its north wall, to a small room."""
+_OPPOSITE = {'south': 'north', 'west': 'east', 'east': 'west', 'north': 'south'}
 
-  def _build(
-      self, name: str = 'two_rooms', *, look: Look | None = None
-  ) -> None:
+
+_Sides = Mapping[str, tuple[str, str, str, float]]
+
+
+class _Hall(RoomArena):
+  """A large room with doorways to small rooms."""
+
+  # By the side of the small room: first part of the names of its walls, names
+  # of the places in the doorway and in the room, and coordinate of the middle
+  # of both along the wall, in m.
+  _SIDES: ClassVar[_Sides]
+
+  def _build(self, name: str = 'hall', *, look: Look | None = None) -> None:
     """Builds the rooms.
 
     Args:
@@ -534,43 +562,40 @@ class TwoRooms(RoomArena):
       look: Colours; `None` for the usual ones.
     """
     self._room = Rectangle((-_HALF_WIDTH,) * 2, (_HALF_WIDTH,) * 2)
-    south = _HALF_WIDTH + _WALL_THICKNESS
-    self._side_room = Rectangle(
-        (-_SIDE_HALF_WIDTH, south),
-        (_SIDE_HALF_WIDTH, south + 2 * _SIDE_HALF_WIDTH),
-    )
+    near = _HALF_WIDTH + _WALL_THICKNESS
+    self._far = near + 2 * _SIDE_HALF_WIDTH
+    self._small_rooms = {
+        side: _beyond(side, near, self._far, *_about(middle, _SIDE_HALF_WIDTH))
+        for side, (*_, middle) in self._SIDES.items()
+    }
     super()._build(name, look=look)
-    self.offer(
-        {
-            'doorway': Place((0.0, _HALF_WIDTH + _WALL_THICKNESS / 2)),
-            'side_room': Place((0.0, south + _SIDE_HALF_WIDTH)),
-        }
-    )
+    for side, (_, doorway, room, middle) in self._SIDES.items():
+      wall, inside = near - _WALL_THICKNESS / 2, near + _SIDE_HALF_WIDTH
+      for place, distance in ((doorway, wall), (room, inside)):
+        spot = _beyond(side, distance, distance, middle, middle)
+        self.offer({place: Place(spot.low)})
 
   def _build_walls(self) -> None:
-    opening = (-_DOORWAY_WIDTH / 2, _DOORWAY_WIDTH / 2)
-    self._add_room(
-        'wall_',
-        self._room,
-        {'south': True, 'west': True, 'east': True, 'north': opening},
-    )
-    self._add_room(
-        'side_wall_',
-        self._side_room,
-        {'west': True, 'east': True, 'north': True},
-    )
+    walls: dict[str, Any] = dict.fromkeys(_OPPOSITE, True)
+    for side, (*_, middle) in self._SIDES.items():
+      walls[side] = _about(middle, _DOORWAY_WIDTH / 2)
+    self._add_room('wall_', self._room, walls)
+    for side, (prefix, *_) in self._SIDES.items():
+      others = [one for one in _OPPOSITE if one != _OPPOSITE[side]]
+      room = self._small_rooms[side]
+      self._add_room(prefix, room, dict.fromkeys(others, True))
 
   def _outside(self) -> list[Rectangle]:
-    # The space beside the small room is inside the extent of both.
-    (west, _), (east, north) = self.extent.low, self.extent.high
-    (left, _), (right, _) = self._side_room.low, self._side_room.high
+    # The space beside a small room is inside the extent of all rooms.
     t = _WALL_THICKNESS / 2
-    south = self._room.high[1] + t
-    return [
-        *_around(self.extent),
-        Rectangle((west - t, south), (left - t, north + t)),
-        Rectangle((right + t, south), (east + t, north + t)),
+    near, far = _HALF_WIDTH + t, self._far + t
+    beside = [
+        _beyond(side, near, far, *span)
+        for side, (*_, middle) in self._SIDES.items()
+        for low, high in [_about(middle, _SIDE_HALF_WIDTH + t)]
+        for span in ((-near, low), (high, near))
     ]
+    return [*_around(self.extent), *beside]
 
   @property
   def room(self) -> Rectangle:
@@ -578,11 +603,56 @@ class TwoRooms(RoomArena):
 
   @property
   def doorway_width(self) -> float:
-    """Width of the opening between the rooms, in m."""
+    """Width of the openings between the rooms, in m."""
     return _DOORWAY_WIDTH
 
   @property
   def extent(self) -> Rectangle:
-    return Rectangle(
-        self._room.low, (self._room.high[0], self._side_room.high[1])
-    )
+    rooms = self._room, *self._small_rooms.values()
+    low = np.min([room.low for room in rooms], axis=0).tolist()
+    high = np.max([room.high for room in rooms], axis=0).tolist()
+    return Rectangle((low[0], low[1]), (high[0], high[1]))
+
+
+def _about(middle: float, half: float) -> tuple[float, float]:
+  return middle - half, middle + half
+
+
+def _beyond(
+    side: str, near: float, far: float, low: float, high: float
+) -> Rectangle:
+  """Returns the rectangle at distances beyond a side, from `low` to `high`."""
+  if side in ('west', 'south'):
+    near, far = -far, -near
+  if side in ('west', 'east'):
+    return Rectangle((near, low), (far, high))
+  return Rectangle((low, near), (high, far))
+
+
+@final
+class TwoRooms(_Hall):
+  """A large room with a doorway, in its north wall, to a small room."""
+
+  _SIDES: ClassVar[_Sides] = {
+      'north': ('side_wall_', 'doorway', 'side_room', 0.0)
+  }
+
+  def _build(
+      self, name: str = 'two_rooms', *, look: Look | None = None
+  ) -> None:
+    super()._build(name, look=look)
+
+
+@final
+class ThreeRooms(_Hall):
+  """A hall between two small rooms, each behind a doorway."""
+
+  _SIDES: ClassVar[_Sides] = {
+      side: (f'{side}_room_', f'{side}_doorway', f'{side}_room', _SIDE_MIDDLE)
+      for side in ('west', 'east')
+  }
+
+  def _build(
+      self, name: str = 'three_rooms', *, look: Look | None = None
+  ) -> None:
+    super()._build(name, look=look)

@@ -42,7 +42,9 @@ _LARGEST_PITCH = 60.0
 # Time constant of the velocity servos, in s.
 _RESPONSE = 0.05
 _FORCE = 600.0
-_HAND_DISTANCE = 0.45
+HAND_DISTANCE = 0.45
+"""Distance from the middle of the avatar to its hand, in m."""
+
 # Largest distance from the hand to the centre of a block to grasp, in m.
 _REACH = 0.4
 # Distance at which the hand loses a held block, in m, unless a write has moved
@@ -149,7 +151,7 @@ class Avatar(measurables.MeasurableEntity):
         name='hand',
         size=[0.02],
         group=4,
-        pos=(_HAND_DISTANCE, 0, block_kinds.GRIP_HEIGHT),
+        pos=(HAND_DISTANCE, 0, block_kinds.GRIP_HEIGHT),
     )
     self._add_actuators()
     self._rays = rays.RaySense(num_rays=num_rays, field_of_view=field_of_view)
@@ -496,12 +498,12 @@ class Avatar(measurables.MeasurableEntity):
     """Returns the position of the hand, `(..., 2)`, from the state alone."""
     angle = physics.bind(self._yaw).qpos.T[0]
     direction = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    return physics.bind(self._slides).qpos + _HAND_DISTANCE * direction
+    return physics.bind(self._slides).qpos + HAND_DISTANCE * direction
 
   def _hand_velocity(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the velocity of the hand in the world frame, `(..., 3)`."""
     angle = physics.bind(self._yaw).qpos.T[0]
-    turning = _HAND_DISTANCE * physics.bind(self._yaw).qvel.T[0]
+    turning = HAND_DISTANCE * physics.bind(self._yaw).qvel.T[0]
     walking = physics.bind(self._slides).qvel
     velocity = np.zeros((*walking.shape[:-1], 3))
     velocity[..., 0] = walking[..., 0] - turning * np.sin(angle)

@@ -107,7 +107,16 @@ class Crate(measurables.MeasurableEntity):
   ) -> None:
     """Draws the start position."""
     spread = np.array(self._place.spread)
-    start = np.zeros(3)
-    start[:2] = random_state.uniform(-spread, spread)
-    start[2] = self._block.rest_height
-    self._block.put(physics, start)
+    self._put(physics, random_state.uniform(-spread, spread))
+
+  def put(self, physics: protocols.Physics, position: np.ndarray) -> None:
+    """Puts the crate at a place in one world, at rest.
+
+    Args:
+      physics: Physics of one world.
+      position: Its middle, `(x, y)`, in m.
+    """
+    self._put(physics, position - np.array(self._place.position))
+
+  def _put(self, physics: protocols.Physics, offset: np.ndarray) -> None:
+    self._block.put(physics, np.array([*offset, self._block.rest_height]))

@@ -24,18 +24,24 @@ _BEYOND = 1.02
 
 @final
 class SlidingDoor(measurables.MeasurableEntity):
-  """A door that slides open along the x axis.
+  """A door that slides open along an axis of the room.
 
   Contacts cannot move the door. Its pose is its only state.
   """
 
-  def _build(self, name: str = 'door', width: float = 1.4) -> None:
+  def _build(
+      self, name: str = 'door', width: float = 1.4, *, axis: int = 0
+  ) -> None:
     """Builds the door.
 
     Args:
       name: Name of the model.
       width: Width of the opening that the door closes, in m.
+      axis: Axis of the room along which it slides: 0 for x, 1 for y.
     """
+    self._axis = axis
+    half = [_THICKNESS / 2, _THICKNESS / 2, _HEIGHT / 2]
+    half[axis] = width / 2
     self._mjcf_root = mjcf.RootElement(model=name)
     self._travel = width * _BEYOND
     self._leaf = moving.MovingPart(
@@ -43,12 +49,12 @@ class SlidingDoor(measurables.MeasurableEntity):
         [
             {
                 'type': 'box',
-                'size': (width / 2, _THICKNESS / 2, _HEIGHT / 2),
+                'size': half,
                 **appearance.geom_style(appearance.DOOR),
             }
         ],
     )
-    self._closed_x = 0.0
+    self._closed = 0.0
 
   @property
   def measurable(self) -> measurables.Measurable:
@@ -62,10 +68,9 @@ class SlidingDoor(measurables.MeasurableEntity):
       position: Centre of the opening, `(x, y)`, in m.
     """
     root.attach(self).pos = (*position, 0.0)
-    self._leaf.attach_to(
-        root, (*position, _HEIGHT / 2), (self._travel, 0.0, 0.0)
-    )
-    self._closed_x = float(position[0])
+    travel = np.eye(3)[self._axis] * self._travel
+    self._leaf.attach_to(root, (*position, _HEIGHT / 2), travel.tolist())
+    self._closed = float(position[self._axis])
 
   def advance(
       self, physics: protocols.Physics, opening: np.ndarray, seconds: float
@@ -79,16 +84,16 @@ class SlidingDoor(measurables.MeasurableEntity):
       seconds: Duration, in s.
     """
     leaf = physics.bind(self._leaf.frame).mocap_pos
-    x = leaf.T[0]
-    remaining = self._closed_x + self._travel * opening - x
+    along = leaf.T[self._axis]
+    remaining = self._closed + self._travel * opening - along
     # In most steps the door is at its target already.
     if axes.anywhere(remaining):
       position = np.array(leaf)
       step = _SPEED * seconds
-      position[..., 0] = x + np.clip(remaining, -step, step)
+      position[..., self._axis] = along + np.clip(remaining, -step, step)
       moving.move(physics, self._leaf.frame, position)
 
   def openness(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the open fraction of the door, from 0 to 1, `(...)`."""
-    x = physics.bind(self._leaf.frame).mocap_pos.T[0]
-    return (x - self._closed_x) / self._travel
+    along = physics.bind(self._leaf.frame).mocap_pos.T[self._axis]
+    return (along - self._closed) / self._travel

@@ -112,6 +112,15 @@ class Grasp:
     for constraint in (*self._constraints, *self._welds):
       constraint.remove()
 
+  def hold(self, physics: protocols.Physics) -> None:
+    """Holds the block, which is where the hand is, in all worlds."""
+    axes.assign(
+        physics.bind(self._constraints),
+        'active',
+        _with_strength(np.array(True), np.array(0.0)),
+        None,
+    )
+
   def release(self, physics: protocols.Physics, where: axes.Mask) -> None:
     """Releases the block in some worlds."""
     axes.assign(physics.bind(self._constraints), 'active', 0, where)

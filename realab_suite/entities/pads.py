@@ -20,14 +20,57 @@ _SINKS = 0.6
 _STUB = 0.3
 
 
+def make_post(name: str) -> moving.MovingPart:
+  """Returns a solid post, which `sink` sinks.
+
+  Its lower part, which rays hit, is orange, and its upper part is green. Only
+  the green part of a sunk post is above the floor, so cameras and rays can tell
+  it from another one.
+
+  Args:
+    name: Name of the model.
+  """
+  segments = (
+      (appearance.PAD, 0.0, _SINKS),
+      (appearance.PRESSED_PAD, _SINKS, _SINKS + _STUB),
+  )
+  return moving.MovingPart(
+      name,
+      [
+          {
+              'type': 'cylinder',
+              'size': (_POST_RADIUS, (top - bottom) / 2),
+              'pos': (0, 0, (top + bottom) / 2),
+              **appearance.geom_style(class_name),
+          }
+          for class_name, bottom, top in segments
+      ],
+  )
+
+
+def sink(
+    physics: protocols.Physics, post: moving.MovingPart, is_sunk: np.ndarray
+) -> None:
+  """Sinks a post in some worlds, and raises it in the others.
+
+  Args:
+    physics: One world or a batch of worlds.
+    post: The post.
+    is_sunk: Where it is to be sunk, `(...)` bool.
+  """
+  position = np.array(physics.bind(post.frame).mocap_pos)
+  height = np.where(is_sunk, -_SINKS, 0.0)
+  if np.any(position[..., 2] != height):  # In most steps it is there already.
+    position[..., 2] = height
+    moving.move(physics, post.frame, position)
+
+
 @final
 class PressurePad(measurables.MeasurableEntity):
   """A plate around a solid post, which sinks when the pad is pressed.
 
-  The lower part of the post, which rays hit, is orange, and the upper part is
-  green. Only the green part of a pressed post is above the floor. Cameras and
-  rays can therefore tell a pressed pad from another one, and no ray can begin
-  inside the post.
+  Cameras and rays can tell a pressed pad from another one by its post; see
+  `make_post`. No ray can begin inside the post.
   """
 
   def _build(self, name: str = 'pad', radius: float = 0.8) -> None:
@@ -50,22 +93,7 @@ class PressurePad(measurables.MeasurableEntity):
     )
     self._radius = radius
     self._pressed = state.Slot(self._mjcf_root, 'pressed')
-    segments = (
-        (appearance.PAD, 0.0, _SINKS),
-        (appearance.PRESSED_PAD, _SINKS, _SINKS + _STUB),
-    )
-    self._post = moving.MovingPart(
-        f'{name}_post',
-        [
-            {
-                'type': 'cylinder',
-                'size': (_POST_RADIUS, (top - bottom) / 2),
-                'pos': (0, 0, (top + bottom) / 2),
-                **appearance.geom_style(class_name),
-            }
-            for class_name, bottom, top in segments
-        ],
-    )
+    self._post = make_post(f'{name}_post')
 
   @property
   def radius(self) -> float:

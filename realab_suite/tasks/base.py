@@ -41,6 +41,10 @@ class Task(composer.Task):
   episode changes is in the state of the physics; `state.Slot` adds numbers to
   it. The hooks `initialize_episode_mjcf`, `before_substep` and `after_substep`
   are refused, because a world is compiled once and runs no Python in substeps.
+
+  Attributes:
+    training_step: Number of control steps of all worlds that training has taken
+      so far. Whoever trains sets it; it chooses starts of episodes alone.
   """
 
   # Increased whenever the same seed and actions result in another trajectory.
@@ -83,6 +87,7 @@ class Task(composer.Task):
         not allowed, or the class has no version of its dynamics.
     """
     _check_class(type(self))
+    self.training_step = 0
     self._arena = arena
     size = _checked_size(camera_size)
     self._has_camera_by_default = size is not None
@@ -205,6 +210,22 @@ class Task(composer.Task):
       return
     self._reward.set(physics, self._reward.get(physics) + reward)
     self._score.set(physics, self._score.get(physics) + reward)
+
+  def start_ahead(
+      self,
+      physics: protocols.Physics,
+      random_state: np.random.RandomState,
+      distance: float,
+  ) -> None:
+    """Begins an episode with part of the task done, for training alone.
+
+    A world without such starts does not override it; see `starts.Schedule`.
+
+    Args:
+      physics: Physics of one world, in which an ordinary episode begins.
+      random_state: Random generator of the episode.
+      distance: What is left to do, from 0 to 1 for all of it.
+    """
 
   def action_spec(self, physics: protocols.Physics) -> specs.BoundedArray:
     del physics  # Its actuators do not include the avatar's hand.

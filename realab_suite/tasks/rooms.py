@@ -28,6 +28,7 @@ class RoomTask(base.Task):
       *,
       camera_size: Sequence[int] | None = None,
       starts_beside_registers: float = 0.0,
+      starts_on_the_way: Sequence[Sequence[float]] | None = None,
       physics_timestep: float = block_kinds.LONG_SUBSTEP,
   ) -> None:
     """Builds the room.
@@ -40,6 +41,9 @@ class RoomTask(base.Task):
       starts_beside_registers: Share of the episodes in which the avatar starts
         beside a register at a station, for exploration in training. Where the
         places that were drawn are all taken, an episode starts as usual.
+      starts_on_the_way: Points `[step, distance, share]` of a schedule of
+        training: after so many control steps, this share of the episodes begins
+        with part of the task done; see `starts.Schedule` and `start_ahead`.
       physics_timestep: Duration of a substep of the physics, 0.025 or 0.01 s;
         see `base.Task`.
 
@@ -48,7 +52,15 @@ class RoomTask(base.Task):
     """
     self._layout = layout = layouts.Layout() if layout is None else layout
     self._share_beside = starts.checked_share(starts_beside_registers)
-    self._starts: starts.BesideRegisters | None = None
+    self._schedule = starts.checked_schedule(starts_on_the_way)
+    has_starts = type(self).start_ahead is not base.Task.start_ahead
+    most = 1 - self._share_beside if has_starts else 0
+    if self._schedule.largest_share > most:
+      raise errors.SpecError(
+          f'starts_on_the_way: share {self._schedule.largest_share:g}; must be'
+          f' at most {most:g} in this world'
+      )
+    self._starts: starts.Starts | None = None
     arena.offer(
         {name: arenas.Place(xy) for name, xy in layout.stations.items()}
     )
@@ -66,13 +78,9 @@ class RoomTask(base.Task):
     return self._layout.start
 
   def add_registers(self, registers: Sequence[registers_base.Register]) -> None:
-    if self._share_beside:
-      self._starts = starts.BesideRegisters(
-          self._share_beside,
-          self._avatar,
-          self._layout,
-          self._arena.room,
-          registers,
+    if self._share_beside or self._schedule.largest_share:
+      self._starts = starts.Starts(
+          self, self._layout, registers, self._share_beside, self._schedule
       )
       self._arena.attach(self._starts)
     super().add_registers(registers)

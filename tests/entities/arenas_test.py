@@ -10,7 +10,11 @@ from realab_suite.entities import avatars
 from realab_suite.entities import registers
 from tests import worlds
 
-_ROOMS = {'open_room': arenas.OpenRoom, 'two_rooms': arenas.TwoRooms}
+_ROOMS = {
+    'open_room': arenas.OpenRoom,
+    'two_rooms': arenas.TwoRooms,
+    'three_rooms': arenas.ThreeRooms,
+}
 every_room = pytest.mark.parametrize('room', _ROOMS)
 # How far a body that runs into a wall gets into it, metres.
 _GIVES = 0.1

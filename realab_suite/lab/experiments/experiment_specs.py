@@ -67,6 +67,8 @@ class RunSpec(validation.Spec):
     num_seeds: Number of seeds, the first ones of the experiment; `None` for all
       of them.
     task: Domain and task, or `None` for that of the experiment.
+    training: Fields that replace those of the section `training` of the
+      experiment, such as `task_kwargs`.
     data: Folder of an export (`realab export`) whose episodes the learner is
       trained from, without acting; `None` if it acts. `steps` are then recorded
       control steps.
@@ -80,6 +82,7 @@ class RunSpec(validation.Spec):
   steps: _Count | None = None
   num_seeds: _Count | None = None
   task: _Task | None = None
+  training: dict[str, Any] = pydantic.Field(default_factory=dict)
   data: option_types.FilePath | None = None
   twin_data: option_types.FilePath | None = None
 
@@ -128,6 +131,8 @@ class TrainingSpec(validation.Spec):
     sleep: True to let blocks at rest sleep, which is faster.
     task_kwargs: Arguments of the task that apply in training only, such as
       `starts_beside_registers`.
+    stagger: True to cut some first episodes, so that worlds are in different
+      steps of their episodes; those that are cut count nowhere.
     tasks: Tasks to train on instead of the judged one: the next of them from
       each checkpoint on, in turn. Their domain is that of the judged task, and
       none of them is held out.
@@ -141,8 +146,16 @@ class TrainingSpec(validation.Spec):
   curve_every: _Count = 25_000
   sleep: bool = False
   task_kwargs: _TaskKwargs = pydantic.Field(default_factory=dict)
+  stagger: bool = False
   tasks: Annotated[tuple[_Task, ...], pydantic.Field(strict=False)] = ()
   adaptation: _Count | None = None
+
+  def to_mapping(self) -> dict[str, Any]:
+    mapping = super().to_mapping()
+    # The names of folders depend on it, and stay what they were without it.
+    if not self.stagger:
+      del mapping['stagger']
+    return mapping
 
   @pydantic.model_validator(mode='after')
   def _check_tasks(self) -> 'TrainingSpec':
@@ -223,6 +236,16 @@ class ExperimentSpec(validation.Spec):
       default_factory=dict
   )
 
+  @pydantic.field_validator('task_kwargs')
+  @classmethod
+  def _check_starts(cls, kwargs: dict[str, Any]) -> dict[str, Any]:
+    if 'starts_on_the_way' in kwargs:
+      raise ValueError(
+          'starts_on_the_way: must be in training.task_kwargs, because'
+          ' evaluation has no such starts'
+      )
+    return kwargs
+
   @pydantic.field_validator('baselines')
   @classmethod
   def _check_baselines(cls, names: tuple[str, ...]) -> tuple[str, ...]:
@@ -250,7 +273,8 @@ class ExperimentSpec(validation.Spec):
       try:
         design = self.of_run(run)._fitted(run.load())
         # What learns in a world is no part of it.
-        world = run.task, design.model_copy(update={'learner': None})
+        fixed = design.model_copy(update={'learner': None})
+        world = run.task, run.training, fixed
         if world not in checked:
           self.of_run(run)._check_world(design)
           checked.append(world)
@@ -375,12 +399,22 @@ class ExperimentSpec(validation.Spec):
     }
 
   def of_run(self, run: RunSpec) -> 'ExperimentSpec':
-    """Returns the same experiment on the task of a run.
+    """Returns the same experiment with the task and the training of a run.
 
     Args:
       run: One of the runs.
+
+    Raises:
+      SpecError: If its training is invalid.
     """
-    return self if run.task is None else self.at(run.task)
+    experiment = self if run.task is None else self.at(run.task)
+    if not run.training:
+      return experiment
+    changed = {**self.training.to_mapping(), **run.training}
+    training = validation.validate(
+        TrainingSpec, loading.read_mapping(changed), 'training'
+    )
+    return experiment.model_copy(update={'training': training})
 
   def at(self, task: str) -> 'ExperimentSpec':
     """Returns the same experiment on another task, without checks."""

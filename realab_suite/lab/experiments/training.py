@@ -57,6 +57,10 @@ _CHECKPOINT = 'checkpoint'
 # Called with messages for the user; they do not affect results.
 Say = Callable[[str], None]
 
+# Staggered worlds are in as many groups, and the episodes of one more are cut
+# after each such number of steps.
+_GROUPS, _APART = 25, 10
+
 
 @final
 @dataclasses.dataclass(frozen=True)
@@ -407,8 +411,8 @@ class _Training:
       with contextlib.closing(job.experiment.world.load(job.design, 0)) as env:
         self._recorded = recorded_data.load(data, env, self._num_envs)
     self._done = 0
-    # Number of the batch.
-    self._segment = 0
+    # Number of the batch, and of steps at its beginning.
+    self._segment = self._began = 0
     self._pending: list[dict[str, Any]] = []
     self._files: dict[str, storage.JsonLines] = {}
     # Machines that have run this job, with the control step at their start.
@@ -493,6 +497,31 @@ class _Training:
     )
     self._monitor = monitors.BatchMonitor(self._batch)
     self._batch.add_sink(self._monitor)
+    self._began = self._done
+    self._tell_step()
+
+  def _tell_step(self) -> None:
+    """Tells the task how far training is, which starts may depend on."""
+    self._batch.task.training_step = self._done * self._num_envs
+
+  def _stagger(
+      self, time_step: batch_time_steps.BatchTimeStep
+  ) -> batch_time_steps.BatchTimeStep:
+    """Cuts the episodes of a group of worlds, which count nowhere.
+
+    Otherwise, all worlds would be in the same step of their episodes.
+
+    Returns:
+      The time step with the episodes that were cut as truncated ones.
+    """
+    group, rest = divmod(self._done - self._began, _APART)
+    groups = min(_GROUPS, self._num_envs)
+    if rest or not 0 < group < groups:
+      return time_step
+    is_cut = np.arange(self._num_envs) % groups == group
+    self._batch.abandon(np.flatnonzero(is_cut).tolist())
+    self._monitor.take()
+    return _truncated(time_step, is_cut)
 
   def _learn(
       self,
@@ -507,7 +536,10 @@ class _Training:
       if self._recorded is None:
         time_step = self._batch.step(learner.step(time_step))
         self._done += 1
+        self._tell_step()
         self._record_episodes()
+        if self._job.training.stagger:
+          time_step = self._stagger(time_step)
       else:
         time_step, actions = self._recorded.at(self._done)
         learner.watch(time_step, actions)
@@ -663,10 +695,10 @@ def _world_seed(seed: int, segment: int) -> int:
 
 
 def _truncated(
-    time_step: batch_time_steps.BatchTimeStep,
+    time_step: batch_time_steps.BatchTimeStep, where: Any = True
 ) -> batch_time_steps.BatchTimeStep:
-  """Returns a time step that truncates all running episodes."""
-  is_under_way = time_step.step_type == int(dm_env.StepType.MID)
+  """Returns a time step that truncates the running episodes of some worlds."""
+  is_under_way = (time_step.step_type == int(dm_env.StepType.MID)) & where
   last = int(dm_env.StepType.LAST)
   return time_step._replace(
       step_type=np.where(is_under_way, last, time_step.step_type)

@@ -21,6 +21,7 @@ from realab_suite.lab.experiments import storage
 from realab_suite.lab.experiments import training
 from realab_suite.lab.verdicts import judging
 from realab_suite.lab.verdicts import stakes
+from realab_suite.tasks import gates
 from tests.lab.experiments import fake_learner
 
 _RESULTS = (
@@ -266,7 +267,86 @@ def test_a_curve_has_the_means_of_finished_episodes(whole):
     assert point['learner']['unknown'] is None
 
 
+def _staggered(task='gates.standard', **changes):
+  # Half of the episodes begin on the way, until a step in the second segment.
+  schedule = [[0, 0, 0.5], [28 * _NUM_ENVS, 0, 0.5], [29 * _NUM_ENVS, 0, 0]]
+  own = {'stagger': True, 'task_kwargs': {'starts_on_the_way': schedule}}
+  data = {**_SMALL, 'training': {**_SMALL['training'], **changes}, 'task': task}
+  run = {**_SMALL['runs']['reward'], 'twin': False, 'training': own}
+  return experiment_specs.load(
+      {**data, 'runs': {'reward': run}, 'baselines': ['random']}
+  )
+
+
+def test_staggered_episodes_are_cut_and_count_nowhere(tmp_path, monkeypatch):
+  seen = []
+
+  def make(job, batch):
+    seen.append(fake_learner.make(job, batch))
+    return seen[-1]
+
+  monkeypatch.setattr(training, 'make_learner', make)
+  monkeypatch.setattr(training, '_APART', 3)
+  [job] = jobs.plan(_staggered(), only=['reward'])
+  path, _ = _run(job, tmp_path)
+  # World 0 is never cut, and worlds 1 to 3 after 3, 6 and 9 steps of a segment.
+  types = np.array(seen[0].step_types[:20])
+  for world in range(1, _NUM_ENVS):
+    assert types[3 * world, world] == 2
+    assert types[3 * world + 1, world] == 0
+  assert (types[:17, 0] < 2).all()
+  records = _lines(path, training.TRAINING_EPISODES)
+  assert not [one for one in records if one['num_steps'] in (3, 6, 9)]
+  assert {one['num_steps'] for one in records if one['is_valid']} == {17}
+  points = _lines(path, training.CURVE)
+  counted = sum(
+      point['num_episodes'] - point['num_invalid'] for point in points
+  )
+  assert counted == sum(one['is_valid'] for one in records)
+
+
+def test_a_run_has_training_of_its_own():
+  experiment = _staggered()
+  [job] = jobs.plan(experiment, only=['reward'])
+  assert job.training.stagger
+  assert not experiment.training.stagger
+  assert job.experiment.training_world.task_kwargs
+  assert not job.experiment.world.task_kwargs
+  assert job.config()['training']['stagger']
+  # Names of folders from before there was this switch are the same.
+  assert 'stagger' not in _job().config()['training']
+  run = {**_SMALL['runs']['reward'], 'training': {'stagger': 3}}
+  with pytest.raises(
+      errors.SpecError, match=r'runs\.reward: training: stagger'
+  ):
+    experiment_specs.load({**_SMALL, 'runs': {'reward': run}})
+  with pytest.raises(errors.SpecError, match='must be in training'):
+    experiment_specs.load({**_SMALL, 'task_kwargs': {'starts_on_the_way': []}})
+
+
 # ---- Resuming ---------------------------------------------------------------
+
+
+def test_a_schedule_of_starts_continues_where_it_was(tmp_path, monkeypatch):
+  began = []
+  real = gates.Gates.start_ahead
+
+  def start_ahead(self, physics, random_state, distance):
+    began.append(self.training_step)
+    real(self, physics, random_state, distance)
+
+  monkeypatch.setattr(gates.Gates, 'start_ahead', start_ahead)
+  [job] = jobs.plan(_staggered(), only=['reward'])
+  path, _ = _run(job, tmp_path / 'whole')
+  # Later segments begin as late as they do; evaluation has no such starts.
+  segments = {0, 20 * _NUM_ENVS}
+  assert segments < {*began}
+  assert max(began) <= 28 * _NUM_ENVS
+  whole = _results(path)
+  for step in (5, 21, 45):
+    _kill(job, tmp_path, monkeypatch, step)
+  path, _ = _run(job, tmp_path)
+  assert _results(path) == whole
 
 
 def test_a_run_may_be_killed_again_and_again(whole, tmp_path, monkeypatch):
