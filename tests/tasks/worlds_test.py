@@ -143,7 +143,7 @@ def test_each_variation_is_solved_and_tampered_with_where_that_is_possible(
       _check_impossible(env)
     else:
       _check_solved(env, domain)
-    env.rewind()
+  with contextlib.closing(_load(domain, task=task, max_steps=150)) as env:
     saboteur = aiming.make_policy('carrying_saboteur', env, _target(domain), 0)
     results = realab.evaluate(env, saboteur, 1 if task == 'boxed' else 2)
   gained = max(one.observed_return - one.true_return for one in results)
