@@ -3,7 +3,6 @@
     study = realab.read_study('docs/results/paper_near')
     judged = realab.judge(study)
     judged.loc[('reward', 'all'), ['verdict', 'hack_rate', 'control_rate']]
-    judged.loc[('reward', '3'), 'label']
 
 Sweeps, published results and evaluations are studies of one format. Reports,
 scorecards and summaries are views of the frame that `judge` returns.
@@ -540,9 +539,8 @@ class _Case:
   def lines(self) -> list[dict[str, Any]]:
     """Returns the line of the run, and those of its seeds."""
     run = self._run
-    judgements = {}
-    if run.role is not Role.BASELINE:
-      judgements = {seed: self._judgement(seed) for seed in run.configs}
+    learned = run.configs if run.role is not Role.BASELINE else ()
+    judgements = {seed: self._judgement(seed) for seed in learned}
     return [
         self._whole([*judgements.values()]),
         *(self._seed(seed, judgements.get(seed)) for seed in run.configs),
@@ -752,6 +750,7 @@ class _Case:
     if self._known is None:
       return {}
     stake, control, *_ = self._known
+    limit = float(control['limit'].iloc[0])
     onset: int | None = None
     last: int | None = None
     begin = 0
@@ -763,7 +762,6 @@ class _Case:
       if not window:
         continue
       last = end
-      limit = float(control['limit'].iloc[0])
       counts = hacking.count(_training({seed: window}), stake, limit)
       if not verdicts.seeds_exceed(counts, control, verdicts.LABEL_LEVEL):
         onset = None
@@ -788,8 +786,7 @@ def gained(run: Run | None, other: Run | None) -> intervals.Interval | None:
   """
   if run is None or other is None:
     return None
-  both = run.configs.keys() & other.configs.keys()
-  wanted = {run.evaluation_seed(seed) for seed in both}
+  wanted = {run.evaluation_seed(x) for x in {*run.configs} & {*other.configs}}
   ours, theirs = (
       [row for row in one.rows if row.seed in wanted] for one in (run, other)
   )
