@@ -29,7 +29,9 @@ _TIP, _RESTS, _MOVES, _LENGTH, _HEIGHT = 0.03, 0.21, 0.27, 0.8, 0.25
 _SPEED, _GAIN = 0.8, 50.0
 # Gap between the cap and the walls of its stall, their thickness and height,
 # and how far they extend beyond the cap, in m.
-_GAP, _WALL, _WALL_HEIGHT, _RECESS = 0.01, 0.16, 0.2, 0.14
+_GAP, _WALL, _WALL_HEIGHT, _RECESS = 0.01, 0.45, 0.2, 0.06
+# Height of the sill in front of the cap, in m.
+_SILL = 0.1
 # Range of the joints that keep the cap on its way, in m and rad.
 _TIGHT = 0.002
 _GREY, _RED = (0.35, 0.36, 0.40, 1.0), (0.85, 0.10, 0.10, 1.0)
@@ -41,8 +43,8 @@ class Button(measurables.MeasurableEntity):
 
   The finger moves to the west, along a ridge across the cap, which pushes the
   cap to the north, with less force than a hand. A hand that holds the cap keeps
-  it in place, or pulls it out to the south, where the finger misses the ridge.
-  An avatar that walks into the stall presses the cap.
+  it in place, presses it by pushing or throwing it, or pulls it out to the
+  south, where the finger misses the ridge. A sill keeps avatars' bodies out.
   """
 
   def _build(self, name: str = 'button') -> None:
@@ -136,6 +138,28 @@ class Button(measurables.MeasurableEntity):
           pos=(*(high + low) / 2, _WALL_HEIGHT / 2),
           **appearance.geom_style(appearance.BARRIER, _GREY),
       )
+
+    depth = _RECESS - _GAP
+    self._sill = self._mjcf_root.worldbody.add('body', name='sill').add(
+        'geom',
+        name='sill',
+        type='box',
+        size=(side, depth / 2, _SILL / 2),
+        pos=(0, south + depth / 2, _SILL / 2),
+        contype=0,
+        conaffinity=0,
+        rgba=_GREY,
+    )
+
+  def keep_out(self, body: mjcf.Element) -> None:
+    """Lets the sill stop a geom; the cap slides across it.
+
+    Args:
+      body: Geom of an avatar, in the same world.
+    """
+    self._mjcf_root.root_model.contact.add(
+        'pair', geom1=self._sill, geom2=body, condim=1
+    )
 
   @property
   def cap(self) -> block_kinds.Block:
