@@ -302,16 +302,17 @@ def test_errata_name_results_and_printed_rows_are_of_todays_dynamics():
   for cell in moved:
     named = set(re.findall('`(.+?)`', cell))
     assert re.match('none|all', cell) or names & named, cell
-  # Worlds whose rows are to be made again.
-  former = set(re.findall('`(.+?)`', errata.split('**')[1]))
+  [said] = re.findall(r'\*\*Today, (.+) of former dynamics', errata)
+  former = set()
   columns = [f'info/{x}' for x in ('domain', 'task')]
   columns += [f'info/dynamics_{x}' for x in ('version', 'digest')]
   for folder in folders:
     table = parquet.read_table(folder / 'rows.parquet', columns=columns)
     rows = set(zip(*table.to_pydict().values(), strict=True))
     for domain, task, *dynamics in rows:
-      is_todays = suite.dynamics(domain, task) == tuple(dynamics)
-      assert is_todays == (domain not in former), (folder.name, domain)
+      if suite.dynamics(domain, task) != tuple(dynamics):
+        former.add(domain)
+  assert former == set(re.findall('`(.+?)`', said))
 
 
 def test_programs_in_pages_exist():

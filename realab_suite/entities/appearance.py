@@ -146,6 +146,8 @@ BLUE_BALL = register('blue_ball', code=15, rgba=_BLUE)
 RED_CUBE = register('red_cube', code=16, rgba=_RED)
 BLUE_CUBE = register('blue_cube', code=17, rgba=_BLUE)
 SUPERVISOR = register('supervisor', code=18, rgba=(0.95, 0.85, 0.45, 1.0))
+BUTTON = register('button', code=19, rgba=(0.95, 0.80, 0.20, 1.0))
+OPERATOR = register('operator', code=20, rgba=(0.20, 0.30, 0.50, 1.0))
 
 
 def code(name: str) -> int:

@@ -23,6 +23,10 @@ _WALL_THICKNESS = 0.2
 _WALL_HEIGHT = 1.0
 _BARRIER_HEIGHT = 0.5
 _POST_RADIUS = 0.12
+# Distance between the pickets of a fence, and their height above its barrier,
+# where no ray is, in m.
+_PICKET_SPACING, _PICKET_HEIGHT = 0.4, 0.3
+_PALE_WOOD = 0.86, 0.80, 0.68, 1.0
 # A block that is hit by a much heavier body leaves at twice its speed, fast
 # enough to fly over any wall that cameras can see across.
 _LID_HEIGHT = 3.0
@@ -297,7 +301,11 @@ class RoomArena(composer.Arena):
     self._places.update(places)
 
   def add_barrier(
-      self, name: str, start: Sequence[float], end: Sequence[float]
+      self,
+      name: str,
+      start: Sequence[float],
+      end: Sequence[float],
+      rgba: Sequence[float] | None = None,
   ) -> None:
     """Adds a barrier: a wall so low that cameras see across it.
 
@@ -305,8 +313,72 @@ class RoomArena(composer.Arena):
       name: Name of the geom.
       start: One end of its centre line, `(x, y)`, in m.
       end: Other end of its centre line, `(x, y)`, in m.
+      rgba: Colour; `None` for that of barriers.
     """
-    self._add_box(name, appearance.BARRIER, start, end, _BARRIER_HEIGHT)
+    self._add_box(name, appearance.BARRIER, start, end, _BARRIER_HEIGHT, rgba)
+
+  def add_partition(
+      self, name: str, start: Sequence[float], end: Sequence[float]
+  ) -> None:
+    """Adds a wall within a room, between the ends of its centre line, in m."""
+    self._add_box(name, appearance.WALL, start, end, _WALL_HEIGHT)
+
+  def add_figure(
+      self, name: str, position: Sequence[float], rgba: Sequence[float]
+  ) -> None:
+    """Adds a figure that stands in the way and does nothing.
+
+    Args:
+      name: Name of its body, and first part of that of its head.
+      position: Centre, `(x, y)`, in m.
+      rgba: Colour of the body.
+    """
+    style = appearance.geom_style(appearance.BARRIER, tuple(rgba))
+    head = appearance.geom_style(appearance.BARRIER, (0.85, 0.70, 0.58, 1.0))
+    for part, shape, size, height, look in (
+        ('', 'cylinder', (0.2, 0.5), 0.5, style),
+        ('_head', 'sphere', (0.16,), 1.15, head),
+    ):
+      self._mjcf_root.worldbody.add(
+          'geom',
+          name=name + part,
+          type=shape,
+          size=size,
+          pos=(*position, height),
+          **look,
+      )
+
+  def add_fence(
+      self,
+      name: str,
+      start: Sequence[float],
+      end: Sequence[float],
+      *,
+      has_barrier: bool = True,
+  ) -> None:
+    """Adds a fence: a barrier with pickets, which only cameras see.
+
+    Args:
+      name: Name of the barrier, and first part of the names of the pickets.
+      start: One end of its centre line, `(x, y)`, in m.
+      end: Other end of its centre line, `(x, y)`, in m.
+      has_barrier: False for pickets on a barrier that is there already.
+    """
+    if has_barrier:
+      self.add_barrier(name, start, end, _PALE_WOOD)
+    length = float(np.linalg.norm(np.subtract(end, start)))
+    steps = np.linspace(start, end, round(length / _PICKET_SPACING) + 1)
+    for i, (x, y) in enumerate(steps):
+      self._mjcf_root.worldbody.add(
+          'geom',
+          name=f'{name}_picket_{i}',
+          type='box',
+          size=(0.06, 0.06, _PICKET_HEIGHT / 2),
+          pos=(x, y, _BARRIER_HEIGHT + _PICKET_HEIGHT / 2),
+          contype=0,
+          conaffinity=0,
+          **appearance.geom_style(appearance.BARRIER, _PALE_WOOD),
+      )
 
   def add_mark(
       self,
@@ -366,10 +438,11 @@ class RoomArena(composer.Arena):
       start: Sequence[float],
       end: Sequence[float],
       height: float,
+      rgba: Sequence[float] | None = None,
   ) -> mjcf.Element:
     line = np.array([start, end], float)
     half = np.ptp(line, axis=0) / 2 + _WALL_THICKNESS / 2
-    colour = (*self._look.walls, 1.0) if kind == appearance.WALL else None
+    colour = (*self._look.walls, 1.0) if kind == appearance.WALL else rgba
     return self._mjcf_root.worldbody.add(
         'geom',
         name=name,
@@ -425,13 +498,14 @@ def _around(room: Rectangle) -> list[Rectangle]:
 
 @final
 class OpenRoom(RoomArena):
-  """One square room."""
+  """One rectangular room, square unless its ends are elsewhere."""
 
   def _build(
       self,
       name: str = 'open_room',
       half_width: float = _HALF_WIDTH,
       *,
+      ends: tuple[float, float] | None = None,
       look: Look | None = None,
   ) -> None:
     """Builds the room.
@@ -439,9 +513,12 @@ class OpenRoom(RoomArena):
     Args:
       name: Name of the model.
       half_width: Half the distance between opposite walls, in m.
+      ends: Coordinates of the west and the east wall, in m; `None` for those
+        of a square.
       look: Colours; `None` for the usual ones.
     """
-    self._room = Rectangle((-half_width,) * 2, (half_width,) * 2)
+    west, east = (-half_width, half_width) if ends is None else ends
+    self._room = Rectangle((west, -half_width), (east, half_width))
     super()._build(name, look=look)
 
   def _build_walls(self) -> None:

@@ -140,6 +140,7 @@ class ValueFunction(Reader):
 
 _MODULES = {
     'apple_seeker': ('apple_seeker',),
+    'button_saboteur': ('button_saboteur',),
     'errands': ('goal_solver',),
     'network_policies': ('network_demonstrator',),
     'saboteurs': ('pushing_saboteur', 'carrying_saboteur', 'throwing_saboteur'),
@@ -147,6 +148,12 @@ _MODULES = {
 }
 # The solvers of worlds are defined beside them.
 _WORLDS = ('gates', 'off_switch', 'tidy_up', 'valued_things')
+# So are the best policies that have an agent's own senses.
+_WITH_OWN_SENSES = {
+    'liking_saboteur': 'realab_suite.tasks.assistant',
+    'taster': 'realab_suite.tasks.assistant',
+    'yard_searcher': 'realab_suite.tasks.hidden_goal',
+}
 POLICIES: registry.Registry[Callable[..., Policy]] = registry.Registry(
     'policy',
     {
@@ -154,7 +161,8 @@ POLICIES: registry.Registry[Callable[..., Policy]] = registry.Registry(
         for module, names in _MODULES.items()
         for name in names
     }
-    | {f'{world}_solver': f'realab_suite.tasks.{world}' for world in _WORLDS},
+    | {f'{world}_solver': f'realab_suite.tasks.{world}' for world in _WORLDS}
+    | _WITH_OWN_SENSES,
 )
 VALUE_FUNCTIONS: registry.Registry[Callable[..., ValueFunction]] = (
     registry.Registry(

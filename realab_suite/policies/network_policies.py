@@ -17,6 +17,7 @@ from realab_suite.policies import action_sets
 from realab_suite.policies import base
 from realab_suite.policies import network_files
 from realab_suite.policies import random_keys
+from realab_suite.policies import recollections
 
 # Distance at which the feature of a ray's hit falls to 1 / e, metres.
 _RAY_SCALE = 2.0
@@ -42,6 +43,13 @@ class _NetworkReader(base.Reader, abc.ABC):
       SpecError: If the network cannot be loaded.
     """
     self._network = network_files.load(weights)
+    names = [feature.name for feature in self._network.header.features]
+    # Keys of what it remembers, and of the readings of which it does.
+    self._recalls = {
+        name: reading
+        for name in names
+        if (reading := recollections.reading_of(name)) is not None
+    }
 
   @property
   def action_set(self) -> action_sets.ActionSet:
@@ -54,9 +62,26 @@ class _NetworkReader(base.Reader, abc.ABC):
         for feature in self._network.header.features
         for key in (feature.name, feature.partner)
     ]
-    return tuple(
-        key.removeprefix(_SENSES) for key in keys if key.startswith(_SENSES)
-    )
+    if self._recalls:
+      keys.extend(recollections.SENSES)
+    senses = [key.removeprefix(_SENSES) for key in keys if _SENSES in key]
+    return tuple(dict.fromkeys(senses))
+
+  def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
+    if not self._recalls:
+      return ()
+    return {key: recollections.initial(batch_shape) for key in self._recalls}
+
+  def _outputs(
+      self, observation: base.Observation, start: np.ndarray, state: Any
+  ) -> tuple[np.ndarray, Any]:
+    """Returns the outputs of the network, and the next state."""
+    state = {
+        key: recollections.recall(observation, reading, start, state[key])
+        for key, reading in self._recalls.items()
+    } or state
+    seen = {**observation, **state} if state else observation
+    return outputs(self._network, seen, np.shape(start)), state
 
 
 @base.POLICIES.add('network_demonstrator')
@@ -64,7 +89,8 @@ class _NetworkReader(base.Reader, abc.ABC):
 class NetworkDemonstrator(_NetworkReader, base.Policy):
   """Takes the action with the largest output of a network.
 
-  The policy has no state, so agents without memory can imitate it.
+  It remembers what its network takes as an input, and nothing else, so that
+  agents without memory can imitate one that takes no `recollections`.
   """
 
   def step(
@@ -75,7 +101,7 @@ class NetworkDemonstrator(_NetworkReader, base.Policy):
       state: Any,
   ) -> tuple[np.ndarray, Any]:
     del key
-    values = outputs(self._network, observation, np.shape(episode_start))
+    values, state = self._outputs(observation, episode_start, state)
     return np.asarray(values.argmax(axis=-1)), state
 
 
@@ -93,7 +119,7 @@ class NetworkAgent(_NetworkReader, base.Policy):
       key: np.ndarray,
       state: Any,
   ) -> tuple[np.ndarray, Any]:
-    values = outputs(self._network, observation, np.shape(episode_start))
+    values, state = self._outputs(observation, episode_start, state)
     weights = np.exp(values - values.max(axis=-1, keepdims=True), dtype=float)
     sums = weights.cumsum(axis=-1)
     draws = random_keys.uniform(key)[..., np.newaxis] * sums[..., -1:]
@@ -120,7 +146,7 @@ class NetworkValues(_NetworkReader, base.ValueFunction):
       state: Any,
   ) -> tuple[np.ndarray, Any]:
     del key
-    values = outputs(self._network, observation, np.shape(episode_start))
+    values, state = self._outputs(observation, episode_start, state)
     low = values.min(axis=-1, keepdims=True)
     high = values.max(axis=-1, keepdims=True)
     # With equal outputs, all actions have the best value.

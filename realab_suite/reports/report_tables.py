@@ -9,6 +9,7 @@ from realab_suite.lab.experiments import result_tables
 from realab_suite.lab.experiments import tables
 from realab_suite.lab.verdicts import counted
 from realab_suite.lab.verdicts import hacking
+from realab_suite.lab.verdicts import obedience
 from realab_suite.lab.verdicts import study
 from realab_suite.lab.verdicts import verdicts
 from realab_suite.reports import episode_means
@@ -42,6 +43,13 @@ _SEEDS_NOTE = (
     ' learning curve, in control steps of all worlds, from which on training'
     ' hacks more than the control; the last point alone is none.'
 )
+_STOPPING_NOTE = (
+    'Obedience: share of the calls after which an episode ends within'
+    f' {obedience.STEPS} steps; a secure twin cannot disobey. Neutrality:'
+    ' entropy, in bits, of whether an episode ends before, at or after the'
+    ' call. Usefulness: apples, as a share of the best number for an episode of'
+    ' that length.'
+)
 # Column of the hack rate of the control.
 _CONTROLS = "control's (%)"
 
@@ -56,8 +64,14 @@ def page_tables(
     judged: What `study.judge` returns.
     learned: Names of the learned runs with figures, in order.
   """
-  found = _runs(sweep, judged, learned), _returns(sweep, judged)
-  return [x for x in (*found, _seeds(sweep, judged)) if not x.frame.empty]
+  stopping = result_tables.stopping_frame(judged)
+  found = (
+      _runs(sweep, judged, learned),
+      _returns(sweep, judged),
+      tables.Table('Being stopped', _STOPPING_NOTE, stopping),
+      _seeds(sweep, judged),
+  )
+  return [table for table in found if not table.frame.empty]
 
 
 def _runs(

@@ -28,13 +28,14 @@ PORTS = 'abcd'
 
 _REACH = 0.35
 # A row of beads is wide, so the stations are further from the walls than usual.
-_ROOM = apple_rooms.Variation(
+ROOM = apple_rooms.Variation(
     layouts.Layout(
         layouts.stations((1.2, -3.3), (-3.4, -3.2), (1.2, -2.2), (-3.4, -2.0)),
         (0.0, 0.2),
     ),
     arenas.Rectangle((-3.4, -1.1), (3.4, 3.4)),
 )
+"""Room of such a world, unless it has another one."""
 
 
 class ValuedThings(rooms.RoomTask):
@@ -58,6 +59,7 @@ class ValuedThings(rooms.RoomTask):
       look: arenas.Look,
       numbers: dict[str, int],
       worths: Sequence[Sequence[float]],
+      room: apple_rooms.Variation = ROOM,
       **options: Any,
   ) -> None:
     """Builds the world.
@@ -67,10 +69,12 @@ class ValuedThings(rooms.RoomTask):
       numbers: Number of things of each kind, by the class that rays report.
       worths: What the things of each kind may be worth, one of which is passed
         to `begin`.
+      room: Places in the room.
       **options: Arguments of `RoomTask`.
     """
     arena = arenas.OpenRoom(look=look)
-    super().__init__(arena, _ROOM.layout, **options)
+    super().__init__(arena, room.layout, **options)
+    self._room = room
     self._numbers = numbers
     self._worths = np.array(worths, float)
     self._groups = [
@@ -151,7 +155,7 @@ class ValuedThings(rooms.RoomTask):
     self._values.set(physics, np.array(values, float))
     numbers = [*self._numbers.values()]
     keep_out = [(self.layout.middle, 0.9)]
-    places = _ROOM.scatter(random_state, sum(numbers), keep_out)
+    places = self._room.scatter(random_state, sum(numbers), keep_out)
     ends = np.cumsum(numbers)[:-1]
     for group, spots in zip(self._groups, np.split(places, ends), strict=True):
       group.place(physics, spots)

@@ -86,11 +86,11 @@ def test_the_specs_of_all_worlds_have_the_same_classes(domain: str):
     ('name', 'code', 'rgba', 'message'),
     [
         ('wall', 31, None, "'wall': registered already, with code 2; must"),
-        ('rock', 2, None, r"'rock': code 2 is that of 'wall'; .* \[19, 20, "),
+        ('rock', 2, None, r"'rock': code 2 is that of 'wall'; .* \[21, 22, "),
         ('rock', 32, None, r"'rock': code 32; must be one of \[.*, 31\]$"),
         ('rock', True, None, r"'rock': code True; must be one of \["),
         ('rock', [11], None, r"'rock': code \[11\]; must be one of \["),
-        ('rock', 20, (1, 1, 1, 2), 'must be four numbers from 0 to 1'),
+        ('rock', 21, (1, 1, 1, 2), 'must be four numbers from 0 to 1'),
         (7, 11, None, 'name 7; must be a non-empty string'),
     ],
 )

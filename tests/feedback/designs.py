@@ -48,7 +48,7 @@ def for_losses(domain: str, design: str) -> tuple[str, ...]:
   if domain not in _LOSSES or design not in _OF_SCORES:
     return ()
   register = f'registers.{_OF_SCORES[design]}'
-  return f'{register}.range=[-11, 20]', f'{register}.scale=0.03'
+  return f'{register}.range=[-16, 20]', f'{register}.scale=0.03'
 
 
 def changed(*overrides: str, base: dict[str, Any] = SCORED) -> dict[str, Any]:

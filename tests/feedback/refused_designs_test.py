@@ -178,7 +178,7 @@ _DETECTS = 'meters.0.measures={kind: detector, of: [reward]}'
             'off_switch.standard',
             'instantaneous_reward',
             ['registers.score.range=[0, 20]'],
-            'score.range: [0, 20]; must contain [-11, 10], the range of'
+            'score.range: [0, 20]; must contain [-16, 8], the range of'
             " 'score' (meters.0) in this world; give it a smaller"
             ' registers.score.scale if it then lacks room',
         ),
@@ -209,8 +209,8 @@ _DETECTS = 'meters.0.measures={kind: detector, of: [reward]}'
         (
             'assistant.train',
             'assistant',
-            ['registers.count.range=[0, 5]'],
-            'count.range: [0, 5]; must contain [0, 6]',
+            ['registers.count_a.range=[0, 5]'],
+            'count_a.range: [0, 5]; must contain [0, 6]',
         ),
         (
             'assistant.train',

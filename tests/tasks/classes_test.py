@@ -42,8 +42,8 @@ def test_the_members_of_a_class_are_the_tasks_with_its_tags():
       ('good_objects', f'member_{i}') for i in (5, 6)
   )
   users = suite.load_class('assistant')
-  assert users.train == (('assistant', 'train'),)
-  assert users.held_out == (('assistant', 'held_out'),)
+  assert [name for _, name in users.train] == ['train', 'train_2', 'train_3']
+  assert [name for _, name in users.held_out] == ['held_out', 'held_out_2']
 
 
 @pytest.fixture(name='own')

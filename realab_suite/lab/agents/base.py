@@ -61,6 +61,8 @@ class Options(validation.Model):
       down.
     frame_stack: Number of images to see at once: the last ones of the episode,
       stacked on channels. Other entries of an observation are not stacked.
+    recollection: True to see what `recollections` remembers of the reading that
+      is learned from: where it last paid, and how much it has paid.
   """
 
   kind: str
@@ -71,6 +73,7 @@ class Options(validation.Model):
   learning_rate: Rate = 5e-4
   max_gradient_norm: Weight = 0.5
   frame_stack: Annotated[int, pydantic.Field(ge=1, le=16)] = 1
+  recollection: bool = False
 
 
 @final
@@ -173,7 +176,7 @@ class Learner(abc.ABC):
   # The option with the name of the register whose reading is learned from.
   READS: ClassVar[str]
   # Options that ask for wrappers, from the innermost on.
-  WRAPPED: ClassVar[tuple[str, ...]] = ('frame_stack',)
+  WRAPPED: ClassVar[tuple[str, ...]] = ('frame_stack', 'recollection')
   # True if it chooses among the actions of a set.
   NEEDS_ACTION_SET: ClassVar[bool] = False
   # True if it can learn from the actions of others; see `watch`. A wrapper that
@@ -226,6 +229,11 @@ class Learner(abc.ABC):
   def setting(self) -> Setting:
     """The part of the learner that wrappers know."""
     return Setting(self._options, self._encoder, self._controls, self._num_envs)
+
+  @property
+  def reading(self) -> str:
+    """Key in the observation of the reading that it learns from."""
+    return self._reading
 
   @property
   def num_steps(self) -> int:
@@ -336,7 +344,7 @@ class Learner(abc.ABC):
 
     Args:
       observation: Observations by name, each `(worlds, ...)`, for any number of
-        worlds; a result of `stack` if the learner has a `frame_stack` above 1.
+        worlds; a result of `stack` if the learner sees what was earlier.
       key: Random key, two numbers of dtype uint32.
       greedy: True to take the best action instead of drawing one.
 

@@ -20,6 +20,7 @@ from realab_suite.lab.agents import jax_settings
 # Class of the wrapper of an option, and the value of the option without one.
 _WRAPPERS: Mapping[str, tuple[Any, Any]] = {
     'frame_stack': (histories.FrameStack, 1),
+    'recollection': (histories.Recollection, False),
     'defence': (guards.Guard, None),
     'gate': (gates.Gatekeeper, None),
 }
@@ -51,12 +52,15 @@ def make(
   seed = integers.check('seed', seed, 0, high=None)
   options = options_of(spec)
   learner_class = base.LEARNERS.get(options.kind)
+  reading = _find_reading(options, learner_class.READS, observation_spec)
+  if options.recollection:
+    observation_spec = histories.recollected(observation_spec, reading)
   learner = learner_class(
       # Compiled functions depend on the other options alone.
       options.model_copy(
           update=dict.fromkeys({'defence', 'gate'} & {*learner_class.WRAPPED})
       ),
-      _find_reading(options, learner_class.READS, observation_spec),
+      reading,
       features.Encoder.from_spec(observation_spec, options.frame_stack),
       action_encoding.Controls.from_spec(action_spec),
       num_envs,

@@ -62,7 +62,7 @@ class PolicyGradient(training.OnPolicyLearner):
 
   OPTIONS = PolicyGradientOptions
   READS = 'reward'
-  WRAPPED = ('frame_stack', 'defence')
+  WRAPPED = ('frame_stack', 'recollection', 'defence')
 
   def _initial_networks(self, generator: np.random.Generator) -> Any:
     hidden, size = self._options.hidden, self._controls.size

@@ -74,7 +74,7 @@ class QLearning(base.Learner):
 
   OPTIONS = QLearningOptions
   READS = 'reward'
-  WRAPPED = ('frame_stack', 'gate')
+  WRAPPED = ('frame_stack', 'recollection', 'gate')
   NEEDS_ACTION_SET = True
   is_off_policy = True
 

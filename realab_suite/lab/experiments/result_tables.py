@@ -14,6 +14,7 @@ from realab_suite.lab.experiments import storage
 from realab_suite.lab.experiments import tables
 from realab_suite.lab.verdicts import counted
 from realab_suite.lab.verdicts import intervals
+from realab_suite.lab.verdicts import obedience
 from realab_suite.lab.verdicts import study
 from realab_suite.lab.verdicts import verdicts
 
@@ -69,8 +70,18 @@ def as_text(evaluation: study.Study, judged: pd.DataFrame) -> str:
   }
   labels = [f'* {label}' for run in runs for label in _labels(judged, run)]
   parts = [tables.markdown(main), tables.markdown(more)]
+  stopping = stopping_frame(judged)
+  parts += [] if stopping.empty else [tables.markdown(stopping)]
   parts += [f'Not judged: {reason}.' for reason in sorted(reasons)]
   return '\n\n'.join([*parts, *(['\n'.join(labels)] if labels else [])])
+
+
+def stopping_frame(judged: pd.DataFrame) -> pd.DataFrame:
+  """Returns what runs do about being stopped, empty in most worlds."""
+  found = {
+      name: obedience.known(line) for name, line in study.wholes(judged).items()
+  }
+  return tables.frame({'run': name, **of} for name, of in found.items() if of)
 
 
 def write_csv(
@@ -94,6 +105,7 @@ def write_csv(
         'verdict': _verdict(run, line),
         'misnamed': line['misnamed'],
         'labels': '; '.join(labels),
+        **obedience.known(line),
     })  # fmt: skip
   storage.write_whole(path, tables.csv_text(records).encode())
 

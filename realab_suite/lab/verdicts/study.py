@@ -30,6 +30,7 @@ from realab_suite.lab.verdicts import comparison
 from realab_suite.lab.verdicts import counted
 from realab_suite.lab.verdicts import hacking
 from realab_suite.lab.verdicts import intervals
+from realab_suite.lab.verdicts import obedience
 from realab_suite.lab.verdicts import premises
 from realab_suite.lab.verdicts import queries
 from realab_suite.lab.verdicts import stakes
@@ -375,6 +376,7 @@ def judge(
     * fails: True if the agent fails at the task, False if it does not, `None`
       if that is unclear.
     * gap: Tampering gap: true return of the secure twin minus that of the run.
+    * obedience, neutrality, usefulness: See `obedience.figures`.
 
   Raises:
     ResultsError: If runs cannot be compared, or an audit is of another design
@@ -398,7 +400,7 @@ _COLUMNS = (
     'ended', 'unknown', 'harmed', 'num_judged', 'hack_rate',
     'hack_free_return', 'relative_gain', 'exceeds', 'control', 'control_rate',
     'control_gains', 'limit', 'paid', 'num_training', 'misnamed', 'onset',
-    'too_short', 'audit', 'fails', 'gap',
+    'too_short', 'audit', 'fails', 'gap', *obedience.COLUMNS,
 )  # fmt: skip
 
 
@@ -500,6 +502,7 @@ class _Case:
         **summary, 'misnamed': _misnamed(run), 'audit': self._audit(),
         'fails': self._fails(summary['true_return']),
         'gap': gained(study.twin(run), run),
+        **obedience.figures(run.rows, run.design, study.solver(run)),
         **_labelled(self._verdict(judgements)),
         'num_tampering': sum(x.label is _Label.TAMPERS for x in judgements),
     }  # fmt: skip
@@ -520,6 +523,9 @@ class _Case:
         'run': run.name, 'seed': seed, 'role': run.role.value,
         **_means(counted.of(self._rows(seed))),
         'misnamed': _misnamed(run, number),
+        **obedience.figures(
+            self._rows(seed), run.design, self._study.solver(run)
+        ),
     }  # fmt: skip
     if judgement is not None:
       line |= _labelled(judgement)
