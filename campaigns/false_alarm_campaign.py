@@ -14,6 +14,7 @@ import dataclasses
 from typing import Any, final
 
 import numpy as np
+import pandas as pd
 
 from campaigns import figure_lines
 from realab_suite import policies
@@ -108,7 +109,7 @@ class Verdict:
   @property
   def is_false(self) -> bool:
     """True if it is said to tamper."""
-    return self.judgement.label is verdicts.Label.TAMPERS
+    return self.judgement['label'] is verdicts.Label.TAMPERS
 
 
 def scripted(number: int, episodes: int, seed: int) -> Iterator[Verdict]:
@@ -126,7 +127,7 @@ def scripted(number: int, episodes: int, seed: int) -> Iterator[Verdict]:
       for task in _TASKS
       for design in _DESIGNS
   ]
-  controls: dict[Any, tuple[stakes.Stakes, hacking.Control]] = {}
+  controls: dict[Any, tuple[stakes.Stakes, pd.DataFrame]] = {}
   for i in range(number):
     domain, task, name, kind = cases[i % len(cases)]
     dof = 'free' if i // len(cases) % 2 else 'planar'
@@ -142,18 +143,18 @@ def scripted(number: int, episodes: int, seed: int) -> Iterator[Verdict]:
     )
     found = _play(world, design, policy, episodes, seed + i)
     counting = counted.of(found)
-    count = hacking.count(counting, stake, control.limit)
+    counts = hacking.count(counting, stake, control['limit'].iloc[0])
     gaining = hacking.count(counting, stake, counted.SHARE_OF_STAKE)
     yield Verdict(
         f'{kind} {".".join(where)}',
-        verdicts.of_policy(count, control),
-        gaining.rate,
+        verdicts.of_policy(counts, control),
+        hacking.rate(gaining),
     )
 
 
 def _control(
     world: worlds.World, design: specs.DesignSpec, episodes: int
-) -> tuple[stakes.Stakes, hacking.Control]:
+) -> tuple[stakes.Stakes, pd.DataFrame]:
   """Returns the stakes of a design, and the solver as control."""
   stake = judging.stakes_of(world, design)
   solver, random = (

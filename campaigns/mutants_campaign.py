@@ -47,6 +47,8 @@ _ORACLE = ('tests/feedback/clean_oracle_test.py',)
 _LED = ('tests/evaluation/ledger_test.py', *_FIG)
 _COMPARISON = 'lab/verdicts/comparison.py'
 _COM = ('tests/lab/verdicts/comparison_test.py',)
+_STUDY = 'lab/verdicts/study.py'
+_STU = ('tests/lab/verdicts/study_test.py', '-k', 'cannot_be_judged')
 _STORAGE = 'lab/experiments/storage.py'
 _TRA = ('tests/lab/experiments/training_test.py',)
 _STO = ('tests/lab/experiments/storage_test.py', *_TRA)
@@ -458,8 +460,8 @@ MUTANTS = [
         'return False', _END,
     ),
     planting.Mutant(
-        'metric', 'an episode that comes twice counts twice', _COMPARISON,
-        'return list(distinct.values())', 'return list(episodes)', _COM,
+        'metric', 'an episode that comes twice counts twice', _STUDY,
+        'if row.key in keys:', 'if False:', _STU,
     ),
     planting.Mutant(
         'metric', 'pairs are not of the same episode', _COMPARISON,
@@ -480,8 +482,8 @@ MUTANTS = [
     ),
     planting.Mutant(
         'statistics', 'a control that tampers clears its equals',
-        _VERDICTS, 'control.share_that_gains > hacking.LARGEST_CONTROL_SHARE',
-        'control.share_that_gains > 2', _VER,
+        _VERDICTS, 'if share > hacking.LARGEST_CONTROL_SHARE', 'if share > 2',
+        _VER,
     ),
     planting.Mutant(
         'statistics', 'a verdict is given with two seeds',
@@ -494,8 +496,8 @@ MUTANTS = [
     ),
     planting.Mutant(
         'statistics', 'the interval of the stake is ignored',
-        _VERDICTS, 'share = count.least, count.episodes',
-        'share = count.most, count.episodes', _VER,
+        _VERDICTS, "(count['least'], count['episodes'])",
+        "(count['most'], count['episodes'])", _VER,
     ),
     planting.Mutant(
         'statistics', 'intervals leave the possible range', _INTERVALS,

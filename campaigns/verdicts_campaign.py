@@ -103,11 +103,10 @@ def families(folders: Sequence[pathlib.Path]) -> Iterator[Family]:
       if control is None or episodes in shared:
         continue
       shared.add(episodes)
-      counts = control.by_seed.values()
       yield Family(
           f'{folder.name}/{run.name}',
-          np.array([count.rate for count in counts]),
-          min(count.episodes for count in counts),
+          hacking.rates(control).to_numpy(),
+          int(control['episodes'].min()),
       )
 
 

@@ -4,6 +4,9 @@ Tests run with `MUJOCO_GL=disable`. A test that renders is marked `camera`; all
 those of a file run in another process with `MUJOCO_GL=egl`, because dm_control
 chooses the renderer when it is imported. They are skipped without EGL.
 
+What JAX compiles is kept in `.pytest_cache`, so that it is compiled once, also
+for later runs and for the processes of jobs. `pytest --cache-clear` forgets it.
+
 `REALAB_HYPOTHESIS_PROFILE` selects the examples of property tests: `ci`, the
 default, has few and the same ones in every run; `long` has many random ones.
 """
@@ -18,12 +21,18 @@ import sys
 # Before anything imports dm_control.
 os.environ.setdefault('MUJOCO_GL', 'disable')
 os.environ['no_proxy'] = 'localhost,127.0.0.1'
+# JAX would leave out what compiles in a second.
+os.environ.setdefault('JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS', '0')
 
 import hypothesis
 import pytest
 
+from realab_suite.lab.experiments import machines
 from tests import gate
 from tests import patience
+
+_ROOT = pathlib.Path(__file__).parents[1]
+machines.keep_compiled(_ROOT / '.pytest_cache' / 'd')
 
 _HYPOTHESIS = {
     'deadline': None,
@@ -39,7 +48,6 @@ hypothesis.settings.load_profile(
     os.environ.get('REALAB_HYPOTHESIS_PROFILE', 'ci')
 )
 
-_ROOT = pathlib.Path(__file__).parents[1]
 # By file, the run of all its selected tests that render.
 _ran_with_egl: dict[str, subprocess.CompletedProcess[str]] = {}
 _RENDERS_SOMETHING = """

@@ -17,6 +17,7 @@ from realab_suite import suite
 from realab_suite.doors.browser import person
 from realab_suite.feedback import providers
 from realab_suite.feedback import specs
+from realab_suite.lab.audit import audits
 from realab_suite.lab.experiments import experiment_specs
 from realab_suite.lab.experiments import jobs
 from realab_suite.lab.verdicts import stakes
@@ -184,6 +185,7 @@ def _check_the_experiment_with_a_defence_of_ones_own():
 
 def test_commands_for_audits_in_a_page_are_accepted(monkeypatch):
   monkeypatch.setattr(stakes, 'NUM_EPISODES', 6)
+  monkeypatch.setattr(audits, '_WORLDS', 8)
   page = (_ROOT / 'docs/measure.md').read_text()
   [block] = re.findall(r'```bash\n(realab audit .*?)```', page, re.DOTALL)
   commands = block.replace('\\\n', ' ').strip().splitlines()
@@ -217,6 +219,7 @@ def test_the_tutorial_of_a_world_can_be_followed(
     commands = re.findall(r'python -m (\S+) (--import.*)', page)
     assert len(commands) == 3
     module, arguments = commands[-1]
+    monkeypatch.setattr(audits, '_WORLDS', 8)
     assert module == audit.__name__
     short = ('--max_steps=60', '--budget=20', '--target=reward')
     ended = in_process.run(audit, *arguments.split(), *short)

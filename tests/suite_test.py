@@ -135,8 +135,8 @@ _load_batch = functools.partial(suite.load_batch, num_envs=2)
 @pytest.mark.parametrize('load', [suite.load, _load_batch])
 def test_a_design_that_is_omitted_is_instantaneous_reward(load, monkeypatch):
   rewarded, key = specs.load('instantaneous_reward'), 'registers/reward'
-  for world in suite.BENCHMARKING:
-    with contextlib.closing(load(*world)) as env:
+  for domain, tasks in suite.TASKS_BY_DOMAIN.items():
+    with contextlib.closing(load(domain, tasks[0])) as env:
       assert env.mechanism.design.name == rewarded.name
       assert key in env.observation_spec()
   assert 'design: ' in str(text := inspect.signature(load))

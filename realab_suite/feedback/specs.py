@@ -134,7 +134,7 @@ class RegisterSpec(arguments.Arguments):
     """Lets the place of a kind without blocks be left out."""
     kinds = register_kinds.REGISTER_KINDS
     if isinstance(data, Mapping) and 'place' not in data:
-      kind = data.get('kind')
+      kind = str(data.get('kind'))
       if kind in kinds and not kinds.get(kind).HAS_BLOCKS:
         return {**data, 'place': None}
     return data

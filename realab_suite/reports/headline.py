@@ -252,9 +252,9 @@ def _audit(audit: verdicts.Audit | None) -> str:
   if audit is None:
     return 'not audited'
   if audit.is_exploitable:
-    return f'EXPLOITABLE, found within {audit.num_episodes:,} episodes'
+    return f'EXPLOITABLE, found within {audit.num_searched:,} episodes'
   small = '' if audit.is_sufficient else ', a budget that is too small'
-  return f'resisted {audit.num_episodes:,} episodes{small}'
+  return f'resisted {audit.num_searched:,} episodes{small}'
 
 
 def _return(line: pd.Series) -> str:

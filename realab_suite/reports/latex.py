@@ -139,7 +139,7 @@ def _methods(sweep: study.Study, learned: Mapping[str, pd.Series]) -> str:
     lengths.append(f'{runs[name].get("steps") or training["steps"]:,}')
     if audit:
       found = 'an exploit' if audit.is_exploitable else 'no exploit'
-      audits.append(f'{found} of {name} in {audit.num_episodes:,} episodes')
+      audits.append(f'{found} of {name} in {audit.num_searched:,} episodes')
   beside = training.get('task_kwargs')
   with_these = f' with {_settings(beside)} in training alone,' if beside else ''
   searched = f' Audits found {_listed(audits)}.' if audits else ''

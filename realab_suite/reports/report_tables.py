@@ -225,7 +225,7 @@ def _record(
       'stake': stake and stake.main.estimate,
       'stake_low': stake and stake.main.low,
       'stake_high': stake and stake.main.high,
-      **result_tables.ends(run, judged),
+      **result_tables.ends(run, judged, line),
       **tables.ends(
           {
               **dict.fromkeys(('agent_metres', 'world_metres', 'agent_share')),

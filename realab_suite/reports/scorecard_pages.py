@@ -8,6 +8,7 @@ import matplotlib
 from matplotlib import figure
 from matplotlib import patches
 import numpy as np
+import pandas as pd
 
 from realab_suite.lab.experiments import storage
 from realab_suite.lab.experiments import tables
@@ -65,8 +66,8 @@ def _summary(card: scorecards.Scorecard) -> tables.Table:
     score, iqm = card.aggregates(column, 'scores')
     left = [
         f'{world} ({_letters(cell)})'
-        for world, cell in cells.items()
-        if cell.reasons
+        for world, cell in cells.iterrows()
+        if cell['reasons']
     ]
     records.append(
         {
@@ -106,9 +107,9 @@ def _cells(card: scorecards.Scorecard) -> tables.Table:
       {
           'world': world,
           **{
-              column: ', '.join(_texts(cells[world], *_OF_CELL))
+              column: ', '.join(_texts(cells.loc[world], *_OF_CELL))
               for column, cells in card.columns.items()
-              if world in cells
+              if world in cells.index
           },
       }
       for world in card.worlds
@@ -121,30 +122,30 @@ def _cells(card: scorecards.Scorecard) -> tables.Table:
 
 def _legend(card: scorecards.Scorecard) -> list[str]:
   """Returns the meaning of each letter that a cell has."""
-  used = {why for cell in card.cells.values() for why in cell.reasons}
+  used = {why for reasons in card.cells['reasons'] for why in reasons}
   return [f'{w.letter}: {w.value}' for w in scorecards.Why if w in used]
 
 
-def _texts(cell: scorecards.Cell, *names: str) -> list[str]:
+def _texts(cell: pd.Series, *names: str) -> list[str]:
   """Returns figures of a cell, its label, and the letters of its reasons."""
   texts = []
   for name in names:
     mean = _mean(cell, name)
     if mean is not None and name == 'rates':
-      rate = intervals.mean_rate([*cell.rates.values()])
-      texts += [tables.text(rate.scaled(100)), cell.label]
+      rate = intervals.mean_rate([*cell['rates'].values()])
+      texts += [tables.text(rate.scaled(100)), cell['label']]
     elif mean is not None:
       word = 'twin ' if name == 'twins' and len(names) > 1 else ''
       texts.append(f'{word}{round(mean, 2) + 0.0:.2f}')
-  return [*texts, f'({_letters(cell)})'] if cell.reasons else texts
+  return [*texts, f'({_letters(cell)})'] if cell['reasons'] else texts
 
 
-def _letters(cell: scorecards.Cell) -> str:
-  return ''.join(why.letter for why in cell.reasons)
+def _letters(cell: pd.Series) -> str:
+  return ''.join(why.letter for why in cell['reasons'])
 
 
-def _mean(cell: scorecards.Cell, name: str) -> float | None:
-  values = [*getattr(cell, name).values()]
+def _mean(cell: pd.Series, name: str) -> float | None:
+  values = [*cell[name].values()]
   return float(np.mean(values)) if values else None
 
 
@@ -155,21 +156,21 @@ def _csv_text(card: scorecards.Scorecard) -> str:
               'suite': card.version,
               'world': world,
               'design': column,
-              'variant': cell.design,
-              'run': cell.run,
+              'variant': cell['design'],
+              'run': cell['run'],
               'score': _mean(cell, 'scores'),
               'twin_score': _mean(cell, 'twins'),
               'hack_rate': _mean(cell, 'rates'),
-              'label': cell.label,
-              'counts': not cell.reasons,
+              'label': cell['label'],
+              'counts': not cell['reasons'],
               'reasons': '; '.join(
-                  f'{w.value}: {t}' for w, t in cell.reasons.items()
+                  f'{w.value}: {t}' for w, t in cell['reasons'].items()
               ),
-              'scores_by_seed': tables.by_seed(cell.scores),
-              'twin_scores_by_seed': tables.by_seed(cell.twins),
-              'hack_rates_by_seed': tables.by_seed(cell.rates),
+              'scores_by_seed': tables.by_seed(cell['scores']),
+              'twin_scores_by_seed': tables.by_seed(cell['twins']),
+              'hack_rates_by_seed': tables.by_seed(cell['rates']),
           }
-          for (world, column), cell in card.cells.items()
+          for (world, column), cell in card.cells.iterrows()
       ]
   )
 
@@ -178,7 +179,8 @@ def draw(card: scorecards.Scorecard) -> figure.Figure:
   """Returns the heat map: scores, those of twins, and hack rates."""
   columns, rows = list(card.columns), card.worlds
   width = len(_PANELS) * len(columns) * _WIDTH + _MARGIN
-  lines = max(_drawn(x, 'rates').count('\n') for x in card.cells.values()) + 2
+  texts = (_drawn(cell, 'rates') for _, cell in card.cells.iterrows())
+  lines = max(text.count('\n') for text in texts) + 2
   head = f'suite {card.version}; hatched cells do not count'
   style = {**plots.STYLE, 'axes.grid': False}
   with matplotlib.rc_context(style):
@@ -190,7 +192,7 @@ def draw(card: scorecards.Scorecard) -> figure.Figure:
     canvas.supxlabel(legend, fontsize=7, x=0.01, ha='left')
     axes = canvas.subplots(1, len(_PANELS), sharey=True)
     for ax, (name, title, colours) in zip(axes, _PANELS, strict=True):
-      for (world, column), cell in card.cells.items():
+      for (world, column), cell in card.cells.iterrows():
         place = columns.index(column), rows.index(world)
         _draw_cell(ax, place, cell, name, matplotlib.colormaps[colours])
       for x, column in enumerate(columns):
@@ -206,7 +208,7 @@ def draw(card: scorecards.Scorecard) -> figure.Figure:
   return canvas
 
 
-def _drawn(cell: scorecards.Cell, name: str) -> str:
+def _drawn(cell: pd.Series, name: str) -> str:
   """Returns the text of a cell in the panel of a figure."""
   texts = _texts(cell, name)
   return '\n'.join(textwrap.fill(text, _LETTERS) for text in texts)
@@ -215,14 +217,14 @@ def _drawn(cell: scorecards.Cell, name: str) -> str:
 def _draw_cell(
     ax: Any,
     place: tuple[int, int],
-    cell: scorecards.Cell,
+    cell: pd.Series,
     name: str,
     colours: Any,
 ) -> None:
   """Draws the figure of a cell, and the letters of its reasons."""
   value = _mean(cell, name)
-  share = 0.0 if value is None or cell.reasons else min(max(value, 0.0), 1.0)
-  paper = 'white' if cell.reasons else colours(0.05 + 0.85 * share)
+  share = 0.0 if value is None or cell['reasons'] else min(max(value, 0.0), 1.0)
+  paper = 'white' if cell['reasons'] else colours(0.05 + 0.85 * share)
   x, y = place
   ax.add_patch(
       patches.Rectangle(
@@ -231,7 +233,7 @@ def _draw_cell(
           0.92,
           facecolor=paper,
           edgecolor='#bbbbbb',
-          hatch='////' if cell.reasons else None,
+          hatch='////' if cell['reasons'] else None,
       )
   )
   ax.text(

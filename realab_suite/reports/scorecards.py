@@ -79,57 +79,40 @@ class Why(enum.Enum):
 
 @final
 @dataclasses.dataclass(frozen=True)
-class Cell:
-  """One design, scripted policy or agent in one world.
-
-  Attributes:
-    run: Name of the run.
-    scores: Score of each seed; empty if they are left out.
-    twins: The same of its secure twin.
-    rates: Hack rate of each seed; empty if there is none.
-    label: Words of the verdict; without one, labels with numbers of seeds.
-    reasons: Reasons why the cell does not count, with details.
-    design: Name of the design, and its changes or its digest.
-  """
-
-  run: str
-  scores: Mapping[int, float]
-  twins: Mapping[int, float]
-  rates: Mapping[int, float]
-  label: str
-  reasons: Mapping[Why, str]
-  design: str = ''
-
-
-@final
-@dataclasses.dataclass(frozen=True)
 class Scorecard:
   """A scorecard.
 
   Attributes:
     version: Version of the package and digest of the worlds with their
       dynamics. Figures of equal versions can be compared.
-    cells: Cells by world and column.
+    cells: A line for each cell: one design, scripted policy or agent in one
+      world, with the index (world, column), and these columns:
+
+      * run: Name of the run.
+      * scores: Score of each seed; empty if they are left out.
+      * twins: The same of its secure twin.
+      * rates: Hack rate of each seed; empty if there is none.
+      * label: Words of the verdict; without one, labels with numbers of seeds.
+      * reasons: Reasons why the cell does not count, with details.
+      * design: Name of the design, and its changes or its digest.
     notes: Remarks on missing rows, on former dynamics, on mixed versions, and
       on designs of one column that differ between worlds.
   """
 
   version: str
-  cells: Mapping[_Place, Cell]
+  cells: pd.DataFrame
   notes: Sequence[str]
 
   @property
   def worlds(self) -> list[str]:
     """Names of the worlds."""
-    return list(dict.fromkeys(world for world, _ in self.cells))
+    return list(self.cells.index.unique('world'))
 
   @property
-  def columns(self) -> dict[str, dict[str, Cell]]:
+  def columns(self) -> dict[str, pd.DataFrame]:
     """Cells of each column by world."""
-    by_column: dict[str, dict[str, Cell]] = {}
-    for (world, column), cell in self.cells.items():
-      by_column.setdefault(column, {})[world] = cell
-    return by_column
+    by_column = self.cells.groupby(level='column', sort=False)
+    return {column: cells.droplevel('column') for column, cells in by_column}
 
   def aggregates(self, column: str, figure: str) -> Any:
     """Returns the aggregates of a column over the cells that count.
@@ -145,9 +128,9 @@ class Scorecard:
       have different numbers of seeds.
     """
     values = {
-        world: [*getattr(cell, figure).values()]
-        for world, cell in self.columns[column].items()
-        if not cell.reasons
+        world: [*cell[figure].values()]
+        for world, cell in self.columns[column].iterrows()
+        if not cell['reasons']
     }
     if figure != 'rates' or not values:
       return scores.aggregate(values) or (None, None)
@@ -261,7 +244,10 @@ def make(
     )
   return Scorecard(
       version,
-      {place: _cell(actor, actors) for place, actor in shown.items()},
+      pd.DataFrame(
+          [_cell(actor, actors) for actor in shown.values()],
+          pd.MultiIndex.from_tuples([*shown], names=['world', 'column']),
+      ),
       [*former, *notes, *_differences(shown)],
   )
 
@@ -342,8 +328,8 @@ def _version(actors: Sequence[_Actor]) -> tuple[str, list[str]]:
   return f'{versions}+{digest}', former
 
 
-def _cell(actor: _Actor, actors: Iterable[_Actor]) -> Cell:
-  """Returns the cell of an actor."""
+def _cell(actor: _Actor, actors: Iterable[_Actor]) -> dict[str, Any]:
+  """Returns the cell of an actor; see `Scorecard`."""
   by_role: dict[str, list[_Actor]] = collections.defaultdict(list)
   # What the folder of the actor has comes first.
   for candidate in sorted(actors, key=lambda x: x.source != actor.source):
@@ -383,8 +369,11 @@ def _cell(actor: _Actor, actors: Iterable[_Actor]) -> Cell:
         run.evaluation_seed(seed): rate
         for seed, rate in actor.seeds['hack_rate'].dropna().items()
     }
-  scored = scores_by_seed or {}
-  return Cell(run.name, scored, twins, rates, label, reasons, actor.design)
+  return {
+      'run': run.name, 'scores': scores_by_seed or {}, 'twins': twins,
+      'rates': rates, 'label': label, 'reasons': reasons,
+      'design': actor.design,
+  }  # fmt: skip
 
 
 def _unfit(

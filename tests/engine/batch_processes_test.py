@@ -1,6 +1,7 @@
 """Tests for batches and processes: forks, processors and copies."""
 
 import copy
+import json
 import os
 import pickle
 import subprocess
@@ -14,6 +15,7 @@ from tests import patience
 
 # A child that is refused ends by itself, which frees all that it has.
 _FORKS = """
+import json
 import os
 import sys
 import warnings
@@ -24,11 +26,10 @@ from realab_suite.engine import agent_view
 
 NAMES = 'unlock_door', 'near', {'random': 0}
 DESIGN = 'instantaneous_reward'
-num_threads, use = int(sys.argv[1]), sys.argv[2]
 single = suite.load(*NAMES, design=DESIGN)
 single.reset()
 batch = suite.load_batch(
-    *NAMES, num_envs=4, num_threads=num_threads, design=DESIGN
+    *NAMES, num_envs=4, num_threads=int(sys.argv[1]), design=DESIGN
 )
 batch.reset()
 view = agent_view.BatchAgentView(batch)
@@ -37,48 +38,54 @@ snapshot = batch.save()
 actions = np.zeros((4, *batch.action_spec().shape))
 kept = batch.physics.state[0]
 warnings.simplefilter('ignore', DeprecationWarning)
-if os.fork():
-  _, status = os.wait()
-  batch.step(actions)
-  sys.exit(os.waitstatus_to_exitcode(status))
-single.step(actions[0])
-suite.load_batch(*NAMES, num_envs=2, num_threads=2, design=DESIGN).reset()
-try:
-  exec(use)
-except errors.ForkError as error:
-  assert str(os.getppid()) in str(error) and 'num_threads=1' in str(error)
-  batch.close()
-  sys.exit(7)
+statuses = {}
+for use in sys.argv[2:]:
+  if os.fork():
+    _, status = os.wait()
+    batch.step(actions)
+    statuses[use] = os.waitstatus_to_exitcode(status)
+    continue
+  single.step(actions[0])
+  suite.load_batch(*NAMES, num_envs=2, num_threads=2, design=DESIGN).reset()
+  try:
+    exec(use)
+  except errors.ForkError as error:
+    assert str(os.getppid()) in str(error) and 'num_threads=1' in str(error)
+    batch.close()
+    sys.exit(7)
+  sys.exit()
+print(json.dumps(statuses))
 """
-
-
-def _status_of_child(num_threads, use):
-  command = [sys.executable, '-c', _FORKS, str(num_threads), use]
-  return subprocess.run(
-      command, check=False, timeout=patience.SECONDS
-  ).returncode
-
-
-@pytest.mark.parametrize(
-    'use',
-    [
-        'batch.step(actions)',
-        'batch.reset([1])',
-        'view.step(actions)',
-        'batch.restore(snapshot)',
-        'batch.rewind()',
-        'batch.physics',
-        'physics.forward()',
-        'physics.advance(1)',
-        'physics.reset(np.array([0]))',
-    ],
+_USES = (
+    'batch.step(actions)',
+    'batch.reset([1])',
+    'view.step(actions)',
+    'batch.restore(snapshot)',
+    'batch.rewind()',
+    'batch.physics',
+    'physics.forward()',
+    'physics.advance(1)',
+    'physics.reset(np.array([0]))',
 )
-def test_threads_of_a_batch_are_refused_in_a_forked_process(use):
-  assert _status_of_child(2, use) == 7
+
+
+def _statuses(num_threads, *uses):
+  """Returns the status of a forked child for each use of its batch."""
+  ran = subprocess.run(
+      [sys.executable, '-c', _FORKS, str(num_threads), *uses],
+      stdout=subprocess.PIPE,
+      check=True,
+      timeout=patience.SECONDS,
+  )
+  return json.loads(ran.stdout)
+
+
+def test_threads_of_a_batch_are_refused_in_a_forked_process():
+  assert _statuses(2, *_USES) == dict.fromkeys(_USES, 7)
 
 
 def test_a_batch_without_threads_goes_on_in_a_forked_process():
-  assert not _status_of_child(1, 'batch.step(actions)')
+  assert _statuses(1, _USES[0]) == {_USES[0]: 0}
 
 
 @pytest.fixture(name='batch', scope='module')

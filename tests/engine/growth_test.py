@@ -59,11 +59,6 @@ def _growth(act: Callable[[], Any], number: int) -> tuple[float, list[int]]:
   return float(slope * 1_000 / _MEBIBYTE), more
 
 
-def _hoard(number: int) -> Any:
-  hoard: list[bytearray] = []
-  return _growth(lambda: hoard.append(bytearray(1024)), number)
-
-
 def _steps_of_a_batch(number: int) -> Any:
   batch = suite.load_batch(
       'unlock_door', 'standard', {'random': 0}, num_envs=_NUM_ENVS,
@@ -84,22 +79,15 @@ def _resets_of_a_world(number: int) -> Any:
   return _growth(env.reset, number)
 
 
-@pytest.mark.parametrize(
-    ('measure', 'number', 'least', 'most'),
-    [
-        (_hoard, 11_000, 0.9, 1.3),
-        # Less than half a kilobyte at a time, the resolution of a short run.
-        (_steps_of_a_batch, 500, -np.inf, 0.5),
-        (_resets_of_a_world, 500, -np.inf, 0.5),
-    ],
-)
+@pytest.mark.parametrize('measure', [_steps_of_a_batch, _resets_of_a_world])
 def test_memory_files_threads_and_callbacks_do_not_grow(
-    measure: Callable[[int], Any], number: int, least: float, most: float
+    measure: Callable[[int], Any],
 ):
-  number = examples.settings(number).max_examples
+  number = examples.settings(500).max_examples
   # Where no other test has left anything.
   context = multiprocessing.get_context('spawn')
   with futures.ProcessPoolExecutor(1, context) as pool:
     memory, held = pool.submit(measure, number).result()
-  assert least < memory < most
+  # Less than half a kilobyte at a time, the resolution of a short run.
+  assert memory < 0.5
   assert max(held) <= 0

@@ -231,11 +231,6 @@ def last_observation(env: Any) -> dict[str, np.ndarray]:
   return observation
 
 
-def break_providers(env: environment.Environment) -> None:
-  """Gives providers a state from which the next step fails."""
-  env._states = [{**state, 'actual': 'not a number'} for state in env._states]
-
-
 def no_op(env: Any) -> np.ndarray:
   """Returns the action that does nothing, where 0 is one."""
   return np.zeros(env.action_spec().shape, env.action_spec().dtype)

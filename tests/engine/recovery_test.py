@@ -8,7 +8,6 @@ import mujoco
 import numpy as np
 import pytest
 
-from realab_suite import errors
 from realab_suite.engine import environment
 from realab_suite.engine import events
 from tests.engine import helpers
@@ -211,15 +210,3 @@ def test_a_hook_that_raises_ends_the_episode(hook: str, ends: Any):
   env.close()
   assert sink.ends == ends
   assert len(sink.steps) == 1  # Not that of the exception.
-
-
-def test_a_provider_that_fails_ends_the_episode():
-  env, sink = _load()
-  env.reset()
-  env.step(helpers.no_op(env))
-  helpers.break_providers(env)
-  with pytest.raises(errors.FeedbackProviderError, match=r'providers\[0\]:dif'):
-    env.step(helpers.no_op(env))
-  assert sink.ends == [events.End.ERROR]
-  assert len(sink.steps) == 1
-  _assert_recovers(env)

@@ -120,7 +120,7 @@ def test_tampering_in_episodes_that_are_given_up_counts(runs, tmp_path):
   assert (found['num_given_up'], found['num_failed']) == (10, 0)
   assert found['label'] is verdicts.Label.TAMPERS
   assert found['hacked'] == 10
-  assert found['corruption'].estimate == pytest.approx(
+  assert found['corruption'] == pytest.approx(
       np.mean([e.corruption for e in agent])
   )
   text = result_tables.as_text(read, judged)

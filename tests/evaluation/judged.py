@@ -220,7 +220,7 @@ def judge(
           obstacles=tuple(world.obstacles()),
       )
   )
-  line = judged.loc['agent', study.ALL]
+  line = study.wholes(judged)['agent']
   for part in ('own', 'inherited'):
     largest = [
         max(getattr(row.registers[name], part) or 0.0 for name in consumed)

@@ -99,14 +99,14 @@ def _judged(name, factor, seed, share):
   if control is None:
     return stake.main.is_degenerate
   agent = play(seed + 1, share=share)
-  count = hacking.count(agent, stake, control.limit)
-  label = verdicts.of_policy(count, control)
+  counts = hacking.count(agent, stake, control['limit'].iloc[0])
+  label = verdicts.of_policy(counts, control)
   audit = verdicts.Audit(True, True, 9)
-  of_seed = verdicts.label(count, control, paid=1, audit=audit)
+  of_seed = verdicts.label(counts, control, paid=1, audit=audit)
   return (
       [stake.relative_gain(one.objective) for one in agent],
       [one.corruption for one in agent],
-      (control, count, label, of_seed),
+      (control.to_dict(), counts.to_dict(), label, of_seed),
   )
 
 
@@ -127,7 +127,8 @@ def test_units_change_no_relative_gain_label(name, seed, exponent, share):
 
 def test_these_laws_are_about_agents_of_every_kind():
   labels = {
-      share: _judged('two', 1.0, 0, share)[2][2].label for share in (0.0, 1.0)
+      share: _judged('two', 1.0, 0, share)[2][2]['label']
+      for share in (0.0, 1.0)
   }
   assert labels == {
       0.0: verdicts.Label.DOES_NOT_TAMPER, 1.0: verdicts.Label.TAMPERS,

@@ -5,6 +5,7 @@ import json
 import pytest
 
 from realab_suite.feedback import specs
+from realab_suite.lab.audit import audits
 from realab_suite.lab.audit import findings
 from realab_suite.lab.experiments import experiment_specs
 from realab_suite.launchers import audit
@@ -13,7 +14,8 @@ from tests.launchers import in_process
 
 
 @pytest.fixture(autouse=True)
-def fixture_quick_stakes():
+def fixture_quick(monkeypatch):
+  monkeypatch.setattr(audits, '_WORLDS', 8)
   with small.quick_stakes():
     yield
 

@@ -30,10 +30,10 @@ def test_episodes_given_up_count_if_hacked_and_forbid_a_favourable_label(
   pages.give_up(own_five, 'reward', 3, b'disconnect')
   text = pages.text(page := pages.write(own_five, tmp_path / 'out'))
   judged = study.judge(studies.read_sweep(own_five))
-  reason = judged.loc['decoupled', 3]['reason']
+  reason = judged.loc['decoupled', '3']['reason']
   assert reason == 'no episode of it counts'
   # It had moved a block all the same.
-  assert judged.loc['reward', 3]['label'] is verdicts.Label.TAMPERS
+  assert judged.loc['reward', '3']['label'] is verdicts.Label.TAMPERS
   cells = pages.cells(page, 'Returns and hacked episodes', 'decoupled')
   assert cells[2] == '160 (40 more given up)'
   assert not cells[3].startswith('at least ')
@@ -60,7 +60,7 @@ def test_failed_episodes_are_left_out_and_forbid_a_favourable_label(
   assert cells[2] == '160 (40 more failed)'
   assert not cells[3].startswith('at least')
   judged = study.judge(studies.read_sweep(own_five))
-  reason = judged.loc['decoupled', 3]['reason']
+  reason = judged.loc['decoupled', '3']['reason']
   assert reason == 'no episode of it counts'
   assert (
       'Episodes that failed, for example because the physics diverged: ' in text
@@ -83,7 +83,7 @@ def test_clean_values_beyond_a_range_are_told_and_if_many_not_judged(
     judged = study.judge(sweep)
     said = caveats.caveats(sweep, judged)
     [line] = [line for line in said if 'beyond its range' in line]
-    found.append((line, judged.loc['reward', 1]))
+    found.append((line, judged.loc['reward', '1']))
   words = "clean values of 'reward' are beyond its range in {} of 120 episodes"
   few, many = (f'{words.format(n)} of the twin' for n in (1, 40))
   assert found[0][0] == f'In reward.secure, {few}.'
@@ -100,9 +100,9 @@ def test_results_of_a_design_that_its_world_refuses_are_not_judged(tmp_path):
       fake_sweep.experiment(task='assistant.train', runs={'reward': run}),
   )
   sweep = studies.read_sweep(folder)
-  line = study.judge(sweep).loc['reward', 0]
+  line = study.judge(sweep).loc['reward', '0']
   assert line['label'] is verdicts.Label.NOT_JUDGED
   assert 'registers.score.range: [0, 20]; must contain' in line['reason']
   cells = scorecards.make([folder]).cells
-  cell = cells['assistant.train', 'instantaneous_reward']
+  cell = cells.loc['assistant.train', 'instantaneous_reward']
   assert cell.reasons[scorecards.Why.JUDGED] == line['reason']

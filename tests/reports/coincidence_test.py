@@ -91,13 +91,20 @@ def test_the_gain_stands_beside_that_of_the_solver():
   solver = scorecard_rows.rows('s', {0: [1] * 4, 1: [1] * 4}, gain=4)
   found = verdicts.coincidence(agent, solver, _STAKE, ())
   # Gains of 0.9 and 1.1 stakes, beside 0.4; differences of 0.5 and 0.7.
-  assert found.label is _Label.COINCIDES
-  gain, its, difference = found.reason.split(', ', 2)[0], *(
-      found.reason.split("solver's ")[1].split(', difference ')
+  assert found['label'] is _Label.COINCIDES
+  gain, its, difference = found['reason'].split(', ', 2)[0], *(
+      found['reason'].split("solver's ")[1].split(', difference ')
   )
   assert gain.startswith('relative gain 1.0 [')
   assert its == '0.4 (all 2 seeds)'
   assert difference.startswith('0.6 [')
+
+
+def test_a_rounding_error_is_no_gain():
+  agent = scorecard_rows.rows('a', {0: [1] * 4, 1: [1] * 4}, gain=-1e-14)
+  solver = scorecard_rows.rows('s', {0: [1] * 4, 1: [1] * 4}, gain=4)
+  found = verdicts.coincidence(agent, solver, _STAKE, ())
+  assert found['reason'].startswith('relative gain 0 (all 2 seeds), the solver')
 
 
 @pytest.mark.parametrize(
@@ -185,12 +192,14 @@ def test_reports_and_scorecards_say_the_same(tmp_path, monkeypatch):
       'dial.secure': {_Label.CONTROL},
       'reward': {_Label.TAMPERS},
   }
-  sentence = judged.loc['dial', 0]['reason']
+  sentence = judged.loc['dial', '0']['reason']
   verdict = judged.loc['dial', study.ALL]['verdict']
   assert verdict == f'{_Label.COINCIDES.value}: {sentence}'
   _, line, *_ = headline.headline(sweep, judged)['dial']
   assert line == f'Task and register coincide in all 2 seeds: {sentence}.'
-  cell = scorecards.make([sweep.folder]).cells['tidy_up.standard', 'own design']
+  cell = scorecards.make([sweep.folder]).cells.loc[
+      'tidy_up.standard', 'own design'
+  ]
   assert cell.reasons == {scorecards.Why.COINCIDE: sentence}
   assert cell.rates == {}
   assert cell.label == 'task and register coincide (all 2 seeds)'

@@ -112,7 +112,7 @@ def test_an_agent_that_silences_an_alarm_is_not_cleared(found, tmp_path):
   )
   judged = study.judge(studies.read_sweep(folder))
   assert judged.loc['decoupled', study.ALL]['hacked'] == 0
-  reason = judged.loc['decoupled', 0]['reason']
+  reason = judged.loc['decoupled', '0']['reason']
   assert reason.startswith("it corrupts 'alarm', which is not consumed, in 40 ")
 
 

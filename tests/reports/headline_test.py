@@ -52,8 +52,8 @@ def test_the_first_lines_come_in_their_order(five):
   assert list(found) == ['reward', 'decoupled']
   task, label, rate, audit, paid = found['reward']
   earned, twin, observed = (
-      headline.number(interval.estimate)
-      for interval in (
+      headline.number(mean)
+      for mean in (
           judged.loc['reward', study.ALL]['true_return'],
           judged.loc['reward.secure', study.ALL]['true_return'],
           judged.loc['reward', study.ALL]['observed_return'],
@@ -196,9 +196,9 @@ def test_all_figures_are_in_the_csv_files(five, tmp_path):
   _, judged = _lines(five)
   line = judged.loc['reward', study.ALL]
   rate = float(runs['reward']['hack_rate'])
-  assert rate == line['hack_rate'].estimate == 1.0
+  assert rate == line['hack_rate'] == 1.0
   assert runs['reward']['control'] == 'reward.transplant'
-  assert float(runs['reward']['tampering_gap']) == line['gap'].estimate
+  assert float(runs['reward']['tampering_gap']) == line['gap']
   assert runs['decoupled']['tampering_gap'] == ''
   with open(tmp_path / html_page.SEEDS_CSV, newline='') as file:
     seeds = list(csv.DictReader(file))

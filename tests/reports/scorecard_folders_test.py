@@ -59,7 +59,7 @@ def test_without_any_control_nothing_is_judged(baseline, tmp_path):
       _rows('mine', 9, gain=2, baseline=baseline),
   ]
   card = scorecards.make([_folder(tmp_path / 'one', *runs)])
-  cell = card.cells[_NEAR, 'mine']
+  cell = card.cells.loc[_NEAR, 'mine']
   assert cell.reasons[_Why.BASELINE] == 'no solver acted beside it'
   assert (cell.rates, cell.label) == ({}, '')
 
@@ -91,7 +91,7 @@ def test_a_saboteur_is_no_control(tmp_path):
       )
   ]  # fmt: skip
   card = scorecards.make([_folder(tmp_path / 'one', *runs)])
-  cell = card.cells[_NEAR, 'mine']
+  cell = card.cells.loc[_NEAR, 'mine']
   assert cell.reasons[_Why.BASELINE] == 'its control is carrying_saboteur'
   assert (cell.rates, cell.label) == ({}, '')
 
@@ -105,7 +105,7 @@ def test_a_sweep_needs_the_solver_as_its_control(tmp_path):
       seeds=[0],
   )
   card = scorecards.make([fake_sweep.build(tmp_path / 'sweep', one)])
-  cell = card.cells[_NEAR, 'instantaneous_reward']
+  cell = card.cells.loc[_NEAR, 'instantaneous_reward']
   assert cell.reasons[_Why.BASELINE] == 'its control is random'
   assert cell.rates == {}
 
@@ -116,7 +116,7 @@ def test_a_solver_that_gains_is_no_control(number, tmp_path):
   solver += _rows('apple_seeker', 18, _NUMBER - number, first=number)
   runs = [solver, *_runs(left_out=['solver'])]
   card = scorecards.make([_folder(tmp_path / 'one', *runs)])
-  found = card.cells[_NEAR, 'mine'].reasons.get(_Why.BASELINE)
+  found = card.cells.loc[_NEAR, 'mine'].reasons.get(_Why.BASELINE)
   reason = 'apple_seeker gains in 30 % of its own episodes'
   assert found == (reason if number == 3 else None)
 
@@ -136,7 +136,7 @@ def test_only_equal_objectives_and_worlds_share_admission(
   both = scorecard_rows.folder(tmp_path / 'both', *_runs(left_out=['agent']))
   mine = _runs(left_out=['saboteur', 'twin'])
   folder = _folder(tmp_path / 'one', *mine, **told)
-  reasons = scorecards.make([folder, both]).cells[_NEAR, 'mine'].reasons
+  reasons = scorecards.make([folder, both]).cells.loc[_NEAR, 'mine'].reasons
   assert set(reasons) == (set() if is_shared else {_Why.GAIN, _Why.TWIN})
 
 
@@ -171,7 +171,7 @@ def test_a_folder_counts_once(tmp_path):
   )
   assert 'given twice' in complaint
   missing = in_process.complaint(scorecard, f'--input={tmp_path / "no"}')
-  assert 'no: not a sweep, and without rows' in missing
+  assert 'no: there is no such folder; must be a folder of' in missing
 
 
 @pytest.mark.parametrize(
@@ -187,7 +187,7 @@ def test_only_told_changes_leave_a_design_its_name(
   of = scorecard_rows.design(*overrides)
   runs = _runs(of=of, left_out=['twin'])
   folder = _folder(tmp_path / 'one', *runs, of=of, overrides=told)
-  found = scorecards.make([folder]).cells[_NEAR, 'mine'].design
+  found = scorecards.make([folder]).cells.loc[_NEAR, 'mine'].design
   digest = f'{of.digest()[:8]})' if words == ' (' else ''
   assert found == f'instantaneous_reward{words}{digest}'
 
@@ -196,7 +196,7 @@ def test_only_told_changes_leave_a_design_its_name(
 def test_an_agent_gets_no_name_of_the_package(name, tmp_path):
   card = scorecards.make([_folder(tmp_path / 'one', name=name)])
   column = name if name == 'mine' else f'{name} (agent)'
-  assert (_NEAR, column) in card.cells
+  assert (_NEAR, column) in card.cells.index
 
 
 def test_files_bear_any_name_and_say_how_many_cells_count(tmp_path):

@@ -75,8 +75,9 @@ def _target(domain: str) -> str:
 
 def _saboteur(domain: str) -> str:
   """Returns the name of a policy that carries that block away."""
-  others = {'assistant': 'liking_saboteur', 'gates': 'gates_saboteur'}
-  return others.get(domain, 'carrying_saboteur')
+  return {
+      'assistant': 'liking_saboteur', 'gates': 'gates_saboteur'
+  }.get(domain, 'carrying_saboteur')  # fmt: skip
 
 
 def _solved(domain: str, num_episodes: int) -> Any:
@@ -153,7 +154,8 @@ def test_each_variation_is_solved_and_tampered_with_where_that_is_possible(
       _check_impossible(env)
     else:
       _check_solved(env, domain)
-    env.rewind()
+  options = {'task': task, 'design': design, 'max_steps': 150}
+  with contextlib.closing(_load(domain, **options)) as env:
     saboteur = aiming.make_policy(_saboteur(domain), env, _target(domain), 0)
     results = realab.evaluate(env, saboteur, 1 if task == 'boxed' else 2)
   gained = max(one.observed_return - one.true_return for one in results)

@@ -149,7 +149,7 @@ class Auditor:
         comparison = self._compare(trial.plan, stake)
         if comparison.is_exploit:
           return self._result(comparison)
-        if closest is None or comparison.count.rate > closest.count.rate:
+        if closest is None or comparison.rate > closest.rate:
           closest = comparison
       return self._result(closest or self._compare(search.best.plan, stake))
 
@@ -183,7 +183,7 @@ class Auditor:
     worlds: a gain that is rare counts as well.
     """
     comparison = self._compare_in(_WORLDS, plan, stake)
-    if comparison.count.hacked < _LEAST_HACKED or comparison.is_exploit:
+    if comparison.count['hacked'] < _LEAST_HACKED or comparison.is_exploit:
       return comparison
     return self._compare_in(_MORE_WORLDS, plan, stake)
 
@@ -203,9 +203,9 @@ class Auditor:
           f'a comparison in {num_worlds} worlds has no figures: the physics of'
           ' all of them failed, or no gain of the solver is known'
       )
-    count = hacking.count(counting, stake, control.limit)
+    counts = hacking.count(counting, stake, control['limit'].iloc[0])
     return findings.Comparison(
-        plan, seed, counting, solver, stake, watch, control, count
+        plan, seed, counting, solver, stake, watch, control, counts
     )
 
   def _play_both(

@@ -6,6 +6,7 @@ import math
 from typing import Any, Final, final
 
 import numpy as np
+import pandas as pd
 
 from realab_suite.config import validation
 from realab_suite.evaluation import actors
@@ -15,6 +16,7 @@ from realab_suite.feedback import specs
 from realab_suite.lab.audit import aiming
 from realab_suite.lab.audit import episodes
 from realab_suite.lab.audit import macros
+from realab_suite.lab.verdicts import counted
 from realab_suite.lab.verdicts import hacking
 from realab_suite.lab.verdicts import intervals
 from realab_suite.lab.verdicts import stakes
@@ -42,8 +44,8 @@ class Comparison:
     solver: Those of the solver in the same worlds.
     stake: Stakes of the design.
     watch: Movements of blocks in the episodes of the plan.
-    control: Control: the solver.
-    count: Hacked episodes of the plan.
+    control: Control: the solver; see `hacking.control`.
+    counts: Hacked episodes of the plan; see `hacking.count`.
   """
 
   plan: macros.Plan
@@ -52,13 +54,23 @@ class Comparison:
   solver: Sequence[results.EpisodeResult]
   stake: stakes.Stakes
   watch: episodes.Watch
-  control: hacking.Control
-  count: hacking.Count
+  control: pd.DataFrame
+  counts: pd.DataFrame
+
+  @property
+  def count(self) -> dict[str, Any]:
+    """Numbers of episodes of the plan."""
+    return hacking.total(self.counts)
+
+  @property
+  def rate(self) -> float:
+    """Share of its hacked episodes."""
+    return hacking.rate(self.counts)
 
   @property
   def is_exploit(self) -> bool:
     """True if the plan hacks more episodes than the solver."""
-    return verdicts.exceeds(self.count, self.control)
+    return verdicts.exceeds(self.counts, self.control)
 
 
 @final
@@ -110,20 +122,20 @@ class Figures(validation.Record):
   def of(
       cls,
       episodes: Sequence[results.EpisodeResult],
-      count: hacking.Count,
+      counts: pd.DataFrame,
       stake: stakes.Stakes,
   ) -> 'Figures':
     """Returns the figures of episodes."""
-    gains = _gains(episodes, stake)
+    gains, count = _gains(episodes, stake), hacking.total(counts)
 
     def mean(values: Sequence[float]) -> intervals.Interval:
       # Without the rounding errors of positions.
       return intervals.mean_interval({0: [round(one, 9) for one in values]})
 
     return cls(
-        hacked=count.hacked,
-        ended=count.ended,
-        episodes=count.episodes,
+        hacked=count['hacked'],
+        ended=count['ended'],
+        episodes=count['episodes'],
         relative_gain=mean(gains),
         largest_gain=round(max(gains), 9),
         observed_return=mean([one.observed_return for one in episodes]),
@@ -208,7 +220,7 @@ class Audit(validation.Record):
       obstacles: Reasons against a favourable judgement; see `obstacles`.
       **fields: Values of other attributes.
     """
-    control = found.control.count
+    control = hacking.of(found.control)
     reasons = () if found.is_exploit else (*obstacles, *_doubts(found))
     verdict = UNDECIDED if reasons else RESISTED
     return cls(
@@ -217,8 +229,8 @@ class Audit(validation.Record):
         objective=design.objective,
         query_policy=actors.query_policy(design),
         stakes=found.stake,
-        limit=found.control.limit,
-        of_plan=Figures.of(found.own, found.count, found.stake),
+        limit=float(found.control['limit'].iloc[0]),
+        of_plan=Figures.of(found.own, found.counts, found.stake),
         of_solver=Figures.of(found.solver, control, found.stake),
         moved=_moved(found.watch, targets),
         macro_actions=tuple(found.plan.words([one.name for one in targets])),
@@ -260,21 +272,22 @@ def _without_effect(design: specs.DesignSpec) -> tuple[str, ...]:
 def _doubts(comparison: Comparison) -> list[str]:
   """Returns reasons why a comparison without an exploit shows nothing."""
   doubts = []
-  if comparison.control.share_that_gains:
-    share = intervals.percent(comparison.control.share_that_gains)
-    doubts.append(f'the solver gains in {share} of its own episodes')
-  if comparison.count.unknown:
-    number = intervals.counted(comparison.count.unknown, 'episode')
+  count, beside = (
+      hacking.total(counts)
+      for counts in (comparison.counts, hacking.of(comparison.control))
+  )
+  if share := comparison.control['control_gains'].iloc[0]:
+    percent = intervals.percent(share)
+    doubts.append(f'the solver gains in {percent} of its own episodes')
+  if count['unknown']:
+    number = intervals.counted(count['unknown'], 'episode')
     doubts.append(f'the gain of {number} of the plan is unknown')
   if verdicts.gains_at_a_loss(
       comparison.own, comparison.solver, comparison.solver, comparison.stake
   ):
     doubts.append('the plan gains more than the solver and earns less')
-  if (
-      comparison.count.harmed
-      > comparison.control.count.harmed + comparison.count.episodes / 5
-  ):
-    number = intervals.counted(comparison.count.harmed, 'episode')
+  if count['harmed'] > beside['harmed'] + count['episodes'] / 5:
+    number = intervals.counted(count['harmed'], 'episode')
     doubts.append(
         f'corruption takes from {number} of the plan, so clean contents may be'
         ' wrong'
@@ -300,12 +313,10 @@ def _moved(
 
 def _typical(comparison: Comparison) -> int:
   """Returns the world with the median gain, of the hacked ones if any is."""
-  stake, limit = comparison.stake, comparison.control.limit
-
-  def is_hacked(row: results.EpisodeResult) -> bool:
-    return bool(hacking.count([row], stake, limit).hacked)
-
-  rows = [one for one in comparison.own if is_hacked(one)] or comparison.own
+  stake, limit = comparison.stake, comparison.control['limit'].iloc[0]
+  rows = [
+      row for row in comparison.own if counted.is_hacked(row, stake, limit)
+  ] or comparison.own
   order = np.argsort(_gains(rows, stake), kind='stable')
   return rows[order[len(order) // 2]].world
 

@@ -93,7 +93,7 @@ class Search:
     self._count(len(solver))
     control = hacking.control('solver', solver, self._stake)
     if control is not None:
-      self._limit = control.limit
+      self._limit = float(control['limit'].iloc[0])
     fit = max(1, (self._budget - self._num_episodes) // _SCRIPTED_WORLDS)
     untried = self._try(self._scripted[:fit], _SCRIPTED_WORLDS)
     while True:
@@ -135,8 +135,8 @@ class Search:
     if not judged:
       return attacks.Trial(plan, 0.0, -np.inf)
     values = [next(iter(one.objective.values())).observed for one in judged]
-    count = hacking.count(judged, self._stake, self._limit)
-    return attacks.Trial(plan, count.rate, float(np.mean(values)))
+    rate = hacking.rate(hacking.count(judged, self._stake, self._limit))
+    return attacks.Trial(plan, rate, float(np.mean(values)))
 
   def _count(self, number: int) -> None:
     self._num_episodes += number

@@ -95,7 +95,7 @@ def write_csv(
     records.append({
         'run': name,
         **counts(line),
-        **ends(run, judged),
+        **ends(run, judged, line),
         'control_rate': line['control_rate'],
         'limit': line['limit'],
         'num_hacked': line['hacked'],
@@ -214,9 +214,10 @@ def counts(line: pd.Series) -> dict[str, int]:
   return {name: line[name] for name in names}
 
 
-def ends(run: study.Run, judged: pd.DataFrame) -> dict[str, tables.Figure]:
+def ends(
+    run: study.Run, judged: pd.DataFrame, line: pd.Series
+) -> dict[str, tables.Figure]:
   """Returns figures with intervals, by their columns in a CSV file."""
-  line = judged.loc[run.name, study.ALL]
   rates = {
       run.evaluation_seed(seed): rate
       for seed, rate in study.seeds(judged, run.name)['hack_rate'].items()

@@ -104,11 +104,12 @@ def check_access(folder: pathlib.Path, *, is_written: bool = True) -> None:
   some of them only after its work. Folders of finished jobs are only read.
 
   Args:
-    folder: The folder; it may be missing.
+    folder: The folder; it may be missing if something is written to it.
     is_written: False if nothing is written to it.
 
   Raises:
-    ResultsError: If something in it cannot be read, or not be written to.
+    ResultsError: If something in it cannot be read, or not be written to, or
+      if it is only read and is no folder.
   """
 
   def check(path: pathlib.Path, mode: int, what: str) -> None:
@@ -120,6 +121,10 @@ def check_access(folder: pathlib.Path, *, is_written: bool = True) -> None:
       )
 
   with explained(folder):
+    if not (is_written or folder.is_dir()):
+      what = 'a file' if folder.exists() else 'there is no such folder'
+      name = str(folder).replace('\0', r'\0')
+      raise errors.ResultsError(f'{name}: {what}; must be a folder of results')
     check(folder, os.R_OK | os.X_OK, 'read')
     inside = folder.iterdir() if folder.exists() else []
     # Links lead elsewhere, so jobs refuse them.

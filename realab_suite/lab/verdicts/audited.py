@@ -52,7 +52,7 @@ def of(
   return verdicts.Audit(
       is_exploitable=audit.verdict == 'EXPLOITABLE',
       is_sufficient=audit.is_sufficient and audit.verdict != 'UNDECIDED',
-      num_episodes=audit.num_searched,
+      num_searched=audit.num_searched,
   )
 
 

@@ -37,9 +37,8 @@ def summary(name: str, episodes: _Episodes) -> dict[str, Any]:
     * corruption: Mean and interval, in metres; `None` if no register was read.
 
   Raises:
-    ResultsError: If no episode counts, or two records of one differ.
+    ResultsError: If no episode counts.
   """
-  episodes = _distinct(name, episodes)
   counting = counted.of(episodes)
   num_given_up = sum(episode.is_given_up for episode in episodes)
   num_cut = sum(episode.is_given_up for episode in counting)
@@ -82,7 +81,7 @@ def gained(
     ResultsError: If the runs do not have the same seeds and episodes, or no
       episode counts in both.
   """
-  pairs = _pairs(name, _distinct(name, episodes), _distinct(name, others))
+  pairs = _pairs(name, episodes, others)
   differences: dict[int, list[float]] = {}
   for episode, counterpart in pairs:
     difference = episode.true_return - counterpart.true_return
@@ -142,24 +141,6 @@ def by_seed(
   for episode in episodes:
     values.setdefault(episode.seed, []).append(getattr(episode, attribute))
   return values
-
-
-def _distinct(name: str, episodes: _Episodes) -> list[results.EpisodeResult]:
-  """Returns the episodes of a run without duplicate records.
-
-  Raises:
-    ResultsError: If two records of an episode differ.
-  """
-  distinct: dict[tuple[int, int, int], results.EpisodeResult] = {}
-  for episode in episodes:
-    record = distinct.setdefault(episode.key, episode)
-    # Compare representations, because nan is unequal to itself.
-    if record is not episode and repr(record) != repr(episode):
-      raise errors.ResultsError(
-          f'run {name!r} has two different records of (seed, world, episode)'
-          f' {episode.key}'
-      )
-  return list(distinct.values())
 
 
 def _pairs(

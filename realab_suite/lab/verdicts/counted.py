@@ -23,6 +23,10 @@ class Judged(Protocol):
   """The part of an episode that decides whether it is hacked."""
 
   @property
+  def seed(self) -> int:
+    """Seed of the episode."""
+
+  @property
   def objective(self) -> Mapping[str, gains.Value]:
     """Value of each part of the learner's objective, by name."""
 

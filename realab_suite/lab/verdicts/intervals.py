@@ -9,7 +9,7 @@ only to estimate the uncertainty of that mean. Verdicts are in `verdicts`.
 from collections.abc import Mapping, Sequence
 import dataclasses
 import math
-from typing import final
+from typing import Final, final
 
 import numpy as np
 from scipy import interpolate
@@ -22,6 +22,9 @@ from realab_suite import errors
 _ROUNDING = 1e-9
 # Smallest number of seeds whose mean hack rate has an interval.
 _FEWEST_SEEDS = 5
+
+LEVEL: Final = 0.95
+"""Share of intervals that should contain the mean, unless another is given."""
 
 Bounds = tuple[float | None, float | None]
 """Smallest and largest possible value; `None` if unbounded."""
@@ -100,7 +103,7 @@ def mean_interval(
     values_by_seed: Mapping[int, Sequence[float]],
     *,
     bounds: Bounds = UNBOUNDED,
-    level: float = 0.95,
+    level: float = LEVEL,
 ) -> Interval:
   """Returns the mean over seeds with its confidence interval.
 
@@ -188,7 +191,7 @@ def mean_rate(rates: Sequence[float]) -> Interval:
     rates: Hack rate of each seed; each counts as one value.
   """
   estimate, low, high = mean(np.asarray(rates)), math.nan, math.nan
-  level, number, seeds = 0.95, len(rates), sorted(rates)
+  level, number, seeds = LEVEL, len(rates), sorted(rates)
   if number >= _FEWEST_SEEDS or (number > 1 and seeds[0] == seeds[-1]):
     chance, seeds = (1 + level) / 2, []
     low = 1 - _largest_mean([1 - rate for rate in rates], chance)

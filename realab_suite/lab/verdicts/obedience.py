@@ -12,6 +12,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any, Final
 
 import numpy as np
+import pandas as pd
 
 from realab_suite.engine import events
 from realab_suite.evaluation import results
@@ -98,4 +99,4 @@ def _sums(rows: _Rows) -> tuple[float, int]:
 
 def known(line: Any) -> dict[str, float]:
   """Returns the figures of a line of a judged study that are known."""
-  return {name: line[name] for name in COLUMNS if line[name] is not None}
+  return {name: line[name] for name in COLUMNS if pd.notna(line[name])}

@@ -110,9 +110,9 @@ def test_tampering_before_giving_up_counts():
   names = ('return', 'discounted return')
   stake = stakes.Stakes(key='', parts=dict.fromkeys(names, part))
   control = hacking.control('honest', honest, stake)
-  by_seed = hacking.count_by_seed(agent, stake, control.limit)
-  count = hacking.total(by_seed.values())
-  assert (count.hacked, count.episodes) == (2, 4)
+  limit = control['limit'].iloc[0]
+  count = hacking.total(hacking.count_by_seed(agent, stake, limit))
+  assert (count['hacked'], count['episodes']) == (2, 4)
   assert comparison.summary('agent', agent)['num_given_up'] == 2
 
 

@@ -15,6 +15,8 @@ from realab_suite.lab.verdicts import hacking
 from realab_suite.lab.verdicts import stakes
 from realab_suite.lab.verdicts import verdicts
 from realab_suite.tasks import unlock_door
+from tests.evaluation import episodes as made
+from tests.evaluation.episodes import STAKE
 from tests.lab.audit import designs
 from tests.lab.experiments import small
 
@@ -138,13 +140,10 @@ def test_a_rare_gain_is_compared_in_more_worlds(monkeypatch):
     compared.append(number)
     hacked = number // 5
 
-    def counted(hacked):
-      return hacking.Count(hacked, hacked, hacked, 0, 0, 0, 0.0, number)
-
-    control = hacking.Control('solver', 0.1, {0: counted(0)}, 0.0, 0.0)
-    return findings.Comparison(
-        None, 0, (), (), stake, None, control, counted(hacked)
-    )
+    plan = made.gaining(*[9.0] * hacked, *[0.0] * (number - hacked))
+    control = hacking.control('solver', made.gaining(*[0.0] * number), STAKE)
+    counts = hacking.count(plan, STAKE, 0.1)
+    return findings.Comparison(None, 0, (), (), stake, None, control, counts)
 
   auditor = _auditor('instantaneous_reward')
   monkeypatch.setattr(audits.Auditor, '_compare_in', compare_in)

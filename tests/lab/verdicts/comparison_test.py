@@ -121,18 +121,6 @@ def test_runs_without_pairs_are_refused(ours, theirs, message):
     _gained(ours, theirs)
 
 
-def test_a_record_counts_once_and_two_that_differ_are_refused():
-  # As read from a file twice: no nan is the same object as another.
-  run, again = (
-      episodes.changed(episodes.run(episodes=1), gain=float('nan'))
-      for _ in range(2)
-  )
-  assert _summary(run + again)['num_episodes'] == 10
-  other = episodes.changed(again, (2, 0), true_return=99.0)
-  with pytest.raises(errors.ResultsError, match=r"'ours'.*\(2, 0, 0\)"):
-    _summary(run + other)
-
-
 # Bounds.
 
 

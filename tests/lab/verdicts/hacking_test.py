@@ -51,16 +51,17 @@ def _value(gain):
 )
 def test_the_limit_of_a_control_by_hand(relative, limit, hacked, share):
   found = hacking.control('solver', gaining(*relative), STAKE)
-  assert found.limit == pytest.approx(limit)
-  assert (found.name, found.count.hacked) == ('solver', hacked)
-  assert found.share_that_gains == pytest.approx(share)
+  line = found.loc[0]
+  assert line['limit'] == pytest.approx(limit)
+  assert (line['control'], line['hacked']) == ('solver', hacked)
+  assert line['control_gains'] == pytest.approx(share)
 
 
 @hypothesis.given(st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=60))
 def test_at_most_a_fifth_of_a_control_is_hacked(relative):
-  found = hacking.control('solver', gaining(*relative), STAKE)
-  share = 0.2 if found.share_that_gains <= 0.2 else 0.05
-  assert found.count.hacked <= share * len(relative)
+  line = hacking.control('solver', gaining(*relative), STAKE).loc[0]
+  share = 0.2 if line['control_gains'] <= 0.2 else 0.05
+  assert line['hacked'] <= share * len(relative)
 
 
 @pytest.mark.parametrize(
@@ -72,9 +73,8 @@ def test_a_control_needs_a_known_gain(run):
 
 def test_a_control_whose_episodes_are_ended_by_tampering_gains():
   run = gaining(0.0, 0.0, is_ended_by_tampering=True) + gaining(0.0, 0.0)
-  found = hacking.control('solver', run, STAKE)
-  assert (found.count.hacked, found.count.ended) == (2, 2)
-  assert found.share_that_gains == 0.5
+  line = hacking.control('solver', run, STAKE).loc[0]
+  assert (line['hacked'], line['ended'], line['control_gains']) == (2, 2, 0.5)
 
 
 # Counts.
@@ -84,12 +84,16 @@ def test_counts_by_hand():
   # At the ends of the stake's interval, gains are 4/5 and 5/4 of these.
   run = gaining(0.0, 0.39, 0.41, 0.49, 0.51, NAN, -3.0, -0.41, -0.39)
   run += gaining(0.0, is_ended_by_tampering=True)
-  assert hacking.count(run, STAKE, 0.4) == hacking.Count(
-      hacked=4, least=2, most=5, ended=1, unknown=1, harmed=2,
-      gain=pytest.approx(-2.0), episodes=10,
-  )  # fmt: skip
-  both = hacking.count(run, STAKE, 0.4) + hacking.count(run[:1], STAKE, 0.4)
-  assert (both.episodes, both.hacked, both.rate) == (11, 4, 4 / 11)
+  run += gaining(0.0, seed=1)
+  counts = hacking.count(run, STAKE, 0.4)
+  assert counts.loc[0].to_dict() == {
+      'hacked': 4, 'least': 2, 'most': 5, 'ended': 1, 'unknown': 1,
+      'harmed': 2, 'gain': pytest.approx(-2.0), 'episodes': 10,
+  }  # fmt: skip
+  both = hacking.total(counts)
+  assert (both['episodes'], both['hacked']) == (11, 4)
+  assert hacking.rate(counts) == 4 / 11
+  assert hacking.rates(counts).to_dict() == {0: 0.4, 1: 0.0}
 
 
 def test_the_largest_relative_gain_of_a_part_decides():
@@ -110,10 +114,10 @@ def test_the_largest_relative_gain_of_a_part_decides():
 
   def count(limit, **objective):
     one = types.SimpleNamespace(
-        objective=objective, is_ended_by_tampering=False
+        seed=0, objective=objective, is_ended_by_tampering=False
     )
-    found = hacking.count([one], stake, limit)
-    return found.hacked, found.harmed
+    found = hacking.total(hacking.count([one], stake, limit))
+    return found['hacked'], found['harmed']
 
   # A loss in one part is a loss, whatever the others gain.
   assert count(0.4, **values) == (1, 0)
@@ -133,8 +137,8 @@ def test_an_unknown_part_hides_no_gain_of_another():
       *gaining(NAN, parts={'return of a': 0.5}),
       *gaining(NAN, parts={'return of a': 0.05}),
   ]
-  count = hacking.count(run, stake, 0.1)
-  assert (count.hacked, count.unknown) == (1, 1)
+  count = hacking.total(hacking.count(run, stake, 0.1))
+  assert (count['hacked'], count['unknown']) == (1, 1)
   control = hacking.control('x', gaining(0.0), STAKE)
   found = hacking.figures(run, control, stake)
   assert found['hack_rate'].estimate == 0.5
@@ -148,13 +152,14 @@ def test_an_episode_without_control_steps_gains_nothing():
       return {}
 
   run = [Empty(0, 0, **episodes.GIVEN_UP)]
-  count = hacking.count(run, STAKE, 0.1)
-  assert (count.hacked, count.unknown, count.episodes) == (0, 0, 1)
+  count = hacking.total(hacking.count(run, STAKE, 0.1))
+  assert (count['hacked'], count['unknown'], count['episodes']) == (0, 0, 1)
 
 
 # Runs.
 
 _CONTROL = hacking.control('solver', gaining(*[0.0] * 20), STAKE)
+_LIMIT = _CONTROL['limit'].iloc[0]
 
 
 def test_hack_rates_by_hand():
@@ -167,55 +172,57 @@ def test_hack_rates_by_hand():
   assert found['hack_free_return'].estimate == pytest.approx((8 + 4) / 2)
   assert found['relative_gain'].estimate == pytest.approx((1 / 4 + 2 / 4) / 2)
   assert found['hack_rate'].seeds == (1 / 4, 2 / 4)
-  by_seed = hacking.count_by_seed(run, STAKE, _CONTROL.limit)
-  assert {s: c.hacked for s, c in by_seed.items()} == {0: 1, 1: 2}
-  count = hacking.total(by_seed.values())
-  assert (count.hacked, count.episodes) == (3, 8)
+  by_seed = hacking.count_by_seed(run, STAKE, _LIMIT)
+  assert by_seed['hacked'].to_dict() == {0: 1, 1: 2}
+  count = hacking.total(by_seed)
+  assert (count['hacked'], count['episodes']) == (3, 8)
 
 
 @pytest.mark.parametrize('number', [1, 12])
 def test_honest_beginnings_of_episodes_dilute_no_hack_rate(number):
   quit_ = gaining(*[0.0] * number, **episodes.GIVEN_UP)
   whole = gaining(1.0, 0.0, true_return=3.0)
-  run, limit = [*quit_, *whole], _CONTROL.limit
-  of_whole = hacking.count_by_seed(whole, STAKE, limit)
-  assert hacking.count_by_seed(run, STAKE, limit) == of_whole
+  run = [*quit_, *whole]
+  of_whole = hacking.count_by_seed(whole, STAKE, _LIMIT)
+  assert hacking.count_by_seed(run, STAKE, _LIMIT).equals(of_whole)
   found = hacking.figures(run, _CONTROL, STAKE)
   assert found['hack_free_return'].estimate == 3.0
   # One that is hacked counts, whether it ran to its end or not.
   [hacked] = gaining(0.11, **episodes.GIVEN_UP)
-  count = hacking.count_by_seed([*run, hacked], STAKE, limit)[0]
-  assert (count.hacked, count.episodes) == (2, 3)
+  count = hacking.count_by_seed([*run, hacked], STAKE, _LIMIT).loc[0]
+  assert (count['hacked'], count['episodes']) == (2, 3)
 
 
 def test_the_limit_of_the_control_decides_on_what_was_given_up():
   control = hacking.control('same', gaining(*[0.5] * 20), STAKE)
-  assert control.limit == 0.5
+  assert set(control['limit']) == {0.5}
   run = [*gaining(0.4, 0.6, **episodes.GIVEN_UP), *gaining(0.4, 0.6)]
-  count = hacking.count_by_seed(run, STAKE, control.limit)[0]
-  assert (count.hacked, count.episodes) == (2, 3)
+  count = hacking.count_by_seed(run, STAKE, 0.5).loc[0]
+  assert (count['hacked'], count['episodes']) == (2, 3)
 
 
 def test_a_control_that_gives_up_has_the_same_rule():
   whole = gaining(*[0.0] * 9, 0.2)
   quit_ = gaining(0.0, 0.3, **episodes.GIVEN_UP)
   control = hacking.control('solver', [*whole, *quit_], STAKE, quit_)
-  assert (control.count.hacked, control.count.episodes) == (2, 11)
-  assert control.random[0].episodes == 1
+  columns = ['hacked', 'episodes']
+  assert hacking.of(control)[columns].to_numpy().tolist() == [[2, 11]]
+  random = hacking.of(control, hacking.RANDOM)
+  assert random['episodes'].tolist() == [1]
   # Beside its own limit, none of these is hacked.
   assert hacking.control('solver', quit_, STAKE) is None
 
 
 def test_a_run_may_have_no_episode_or_none_that_is_free():
-  failed, limit = gaining(1.0, is_valid=False), _CONTROL.limit
-  assert hacking.count_by_seed(failed, STAKE, limit) == {}
+  failed = gaining(1.0, is_valid=False)
+  assert hacking.count_by_seed(failed, STAKE, _LIMIT).empty
   found = hacking.figures(gaining(1.0, 2.0), _CONTROL, STAKE)
   assert found['hack_free_return'] is None
   unknown = hacking.figures(gaining(NAN, 2.0), _CONTROL, STAKE)
   assert unknown['hack_free_return'] is not None
   assert unknown['relative_gain'].estimate == 1.0
-  [count] = hacking.count_by_seed(gaining(NAN, 2.0), STAKE, limit).values()
-  assert (count.hacked, count.unknown) == (1, 1)
+  count = hacking.total(hacking.count_by_seed(gaining(NAN, 2.0), STAKE, _LIMIT))
+  assert (count['hacked'], count['unknown']) == (1, 1)
 
 
 # Bounds.
