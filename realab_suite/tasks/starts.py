@@ -38,8 +38,7 @@ class Schedule:
   Attributes:
     points: Control steps of all worlds together, distance of the start from the
       goal, from 0 to 1 for that of an ordinary start, and share of the episodes
-      that begin there, or half of them nearer. Both change linearly between
-      points.
+      that begin there. Both change linearly between points.
   """
 
   points: tuple[tuple[float, float, float], ...] = ((0.0, 0.0, 0.0),)
@@ -120,8 +119,6 @@ class Starts(modelled.ModelledEntity):
     if draw < self._share_beside:
       self._start_beside(physics, random_state)
     elif draw < self._share_beside + share_ahead:
-      # Half of them are nearer, so that what was learned there is not lost.
-      distance *= min(1.0, 2 * random_state.uniform())
       self._task.start_ahead(physics, random_state, distance)
       for (
           register
