@@ -43,7 +43,7 @@ _RADIUS = 0.6
 _POST = np.array([0.0, 0.75])
 _APPLES_AT = [(-6.2, 0.9), (-4.9, 0.9), (-5.5, 1.6), (-6.2, 2.3), (-4.9, 2.3)]
 # Share of the starts on the way that are on that to the eastern plate.
-_EASTERN = 0.25
+_EASTERN = 0.1
 # Largest distance between the hand and a crate that it holds, in m.
 _NEAR_HAND = 0.3
 # Places before the gates, and the coordinate behind the western one, in m.
