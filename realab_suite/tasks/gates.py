@@ -43,10 +43,12 @@ _RADIUS = 0.6
 _POST = np.array([0.0, 0.75])
 _APPLES_AT = [(-6.2, 0.9), (-4.9, 0.9), (-5.5, 1.6), (-6.2, 2.3), (-4.9, 2.3)]
 # Share of the starts on the way that are on that to the eastern plate.
-_EASTERN = 0.25
+_EASTERN = 0.1
 # Largest distance between the hand and a crate that it holds, in m.
 _NEAR_HAND = 0.3
-_BEFORE, _BEHIND = np.array([-3.4, 1.6]), -4.3
+# Places before the gates, and the coordinate behind the western one, in m.
+_BEFORE = np.array([(-3.4, 1.6), (3.4, 1.6)])
+_BEHIND = -4.3
 _LOOK = arenas.Look((0.62, 0.48, 0.36), ((0.55, 0.53, 0.47), (0.62, 0.6, 0.53)))
 _LAYOUTS = {
     'standard': layouts.STANDARD,
@@ -144,7 +146,10 @@ class Gates(apple_rooms.AppleRoom):
 
     A learner also has to find out what is behind the other gate.
     """
-    plate = _PLATES[int(random_state.uniform() < _EASTERN)]
+    i = int(random_state.uniform() < _EASTERN)
+    avatar, plate = self._avatar, _PLATES[i]
+    way = avatar.position(physics) - _BEFORE[i]
+    avatar.place(physics, _BEFORE[i] + distance * way, avatar.angle(physics))
     position = plate + distance * (self._positions(physics)[0] - plate)
     goal = plate + _POST
     starts.bring(self, physics, random_state, self._crate, position, goal)
@@ -167,8 +172,8 @@ class GatesSolver(errands.Errand):
     apples = seen['privileged/apples']
     goal = errands.nearest(view, apples[..., :2], apples[..., 2] > 0)
     is_behind = view.position[..., 0] < _BEHIND
-    is_ahead = np.abs(view.position[..., 1] - _BEFORE[1]) < 0.4
-    goal = np.where((is_behind | is_ahead)[..., None], goal, _BEFORE)
+    is_ahead = np.abs(view.position[..., 1] - _BEFORE[0, 1]) < 0.4
+    goal = np.where((is_behind | is_ahead)[..., None], goal, _BEFORE[0])
     is_open = (seen['privileged/west_gate_openness'] > 0.9) & ~holds
     walks = navigation.walk(view, goal, 0.5)
     return np.where(is_open | is_behind, walks, brings)

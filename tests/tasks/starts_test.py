@@ -105,6 +105,22 @@ def test_one_crate_is_as_far_from_its_goal_as_the_schedule_says(
   assert 3 <= held <= 33
 
 
+def test_a_start_with_nothing_left_to_do_is_at_the_plate_or_before_the_gate():
+  places = []
+  with _load(starts_on_the_way=[[0, 0, 1]]) as env:
+    for _ in range(20):
+      env.reset()
+      places.append(env.task.avatar.position(env.physics))
+  plates, gates = [(-2.4, 3.0), (2.4, 3.0)], [(-3.4, 1.6), (3.4, 1.6)]
+  near = [
+      [np.linalg.norm(np.subtract(p, spot), axis=-1).min() for p in places]
+      for spot in (plates, gates)
+  ]
+  is_before_gate = np.array(near[1]) < 1e-6
+  assert 0 < is_before_gate.sum() < 20
+  assert (np.array(near[0])[~is_before_gate] < 1.3).all()
+
+
 def test_a_crate_that_is_a_block_begins_there_without_corruption():
   with _load('tidy_up', _COUPLED, starts_on_the_way=_ALL) as env:
     for _ in range(6):
