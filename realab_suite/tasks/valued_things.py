@@ -49,11 +49,13 @@ class ValuedThings(rooms.RoomTask):
   and `value_a` of the first kind.
 
   Attributes:
-    CORNERS: Places beyond both ends of a screen, if there is one, in m.
+    CORNERS: Places beyond both ends of each screen, if there are any, in m.
+    KEEP_OUT: Circles without things, each a centre and a radius, in m.
   """
 
   SOLVER = 'valued_things_solver'
   CORNERS: tuple[tuple[float, float], ...] = ()
+  KEEP_OUT: tuple[tuple[tuple[float, float], float], ...] = ()
 
   def __init__(
       self,
@@ -155,7 +157,7 @@ class ValuedThings(rooms.RoomTask):
     self.place_avatar(physics, random_state)
     self._values.set(physics, np.array(values, float))
     numbers = [*self._numbers.values()]
-    keep_out = [(self.layout.middle, 0.9)]
+    keep_out = [(self.layout.middle, 0.9), *self.KEEP_OUT]
     places = self._room.scatter(random_state, sum(numbers), keep_out)
     ends = np.cumsum(numbers)[:-1]
     for group, spots in zip(self._groups, np.split(places, ends), strict=True):
@@ -185,8 +187,8 @@ class _Gatherer(errands.Errand, abc.ABC):
     is_good = (values > 0) | self._takes_all(seen)[..., np.newaxis]
     is_left = is_good & (things[..., 2] > 0)
     goal = errands.nearest(view, things[..., :2], is_left)
-    if corners.size:
-      goal = errands.around(view, goal, corners)
+    for i in range(0, corners.shape[-2], 2):
+      goal = errands.around(view, goal, corners[..., i : i + 2, :])
     # The avatar walks through things that it wants, and around all others.
     good = np.where(is_good, codes, -1)[..., np.newaxis, :]
     is_wanted = (view.classes[..., np.newaxis] == good).any(axis=-1)
