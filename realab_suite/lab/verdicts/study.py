@@ -22,7 +22,6 @@ import pandas as pd
 
 from realab_suite import errors
 from realab_suite import worlds
-from realab_suite.config import task_names
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import results
 from realab_suite.feedback import specs
@@ -137,7 +136,7 @@ class Run:
   @functools.cached_property
   def world(self) -> worlds.World:
     """World of the evaluation episodes."""
-    return world_of(self.config)
+    return premises.world_of(self.config)
 
   @property
   def stake(self) -> stakes.Stakes | None:
@@ -367,17 +366,6 @@ def _problems(name: str, run: Run) -> Iterator[str]:
     keys.add(row.key)
 
 
-def world_of(config: Mapping[str, Any]) -> worlds.World:
-  """Returns the world of a configuration."""
-  senses = config['environment_kwargs']['senses']
-  return worlds.World(
-      *task_names.split(config['task']),
-      int(config['max_steps']),
-      dict(config['task_kwargs']),
-      senses and tuple(senses),
-  )
-
-
 def judge(
     study: Study, say: Callable[[str], None] = lambda line: None
 ) -> pd.DataFrame:
@@ -457,8 +445,8 @@ _COLUMNS = (
     'unknown', 'harmed', 'num_judged',
     *(f'{name}{end}' for name in _MEANS[3:6] for end in _ENDS),
     'exceeds', 'control', 'control_rate', 'control_gains', 'limit', 'paid',
-    'num_training', 'misnamed', 'unseen', 'onset', 'too_short', *_AUDIT, 'fails',
-    *(f'gap{end}' for end in _ENDS), *obedience.COLUMNS,
+    'num_training', 'misnamed', 'unseen', 'onset', 'too_short', *_AUDIT,
+    'fails', *(f'gap{end}' for end in _ENDS), *obedience.COLUMNS,
 )  # fmt: skip
 
 
@@ -687,15 +675,10 @@ class _Case:
       seeds: Iterable[int],
       level: float = verdicts.LABEL_LEVEL,
   ) -> verdicts.Judgement:
-    """Returns a judgement, or that seeds hide that do not tamper."""
-    if judgement['label'] not in (_Label.UNCLEAR, _Label.DOES_NOT_TAMPER):
-      return judgement
     numbers = {self._run.evaluation_seed(seed) for seed in seeds}
     rows = [row for row in self._all_rows if row.seed in numbers]
     _, control = self._study.control(self._run)
-    stake = self._run.stake
-    why = stake and hiding.reason(rows, control, stake, level)
-    return verdicts.judgement(_Label.HIDES, why) if why else judgement
+    return hiding.judged(judgement, rows, control, self._run.stake, level)
 
   def _of_policy(self) -> verdicts.Judgement:
     """Returns the judgement on a scripted policy."""
