@@ -21,6 +21,7 @@ from realab_suite.lab.experiments import scheduler
 from realab_suite.lab.experiments import storage
 from realab_suite.lab.experiments import training
 from realab_suite.lab.verdicts import hacking
+from realab_suite.lab.verdicts import premises
 from realab_suite.lab.verdicts import study
 
 _Model = TypeVar('_Model', bound=pydantic.BaseModel)
@@ -374,7 +375,7 @@ def _check_job(
       runs['stages'] = tuple(f'{job.run}.{stage}' for stage in jobs.STAGES)
     designs = {'transplants': config['embedded']}
     of_world = {'task': config['task'], 'max_steps': config['max_steps']}
-    study.world_of(config)
+    premises.world_of(config)
   for part, names in {**dict.fromkeys(parts, ()), **runs}.items():
     rows = parts.get(part, ())
     for number, row in enumerate(rows, start=1):
