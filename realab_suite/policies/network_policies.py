@@ -75,7 +75,16 @@ class _NetworkReader(base.Reader, abc.ABC):
   def _outputs(
       self, observation: base.Observation, start: np.ndarray, state: Any
   ) -> tuple[np.ndarray, Any]:
-    """Returns the outputs of the network, and the next state."""
+    """Returns the outputs of the network, and the next state.
+
+    Raises:
+      SpecError: If an input is missing from the observation, or of what it
+        remembers.
+    """
+    for reading in self._recalls.values():
+      base.check_senses(
+          'network', (reading, *recollections.SENSES), observation, 'observed'
+      )
     state = {
         key: recollections.recall(observation, reading, start, state[key])
         for key, reading in self._recalls.items()

@@ -6,7 +6,8 @@ beginning. The tasks are members of a class, users with other worths: 1 or -1 in
 `train`, 1 or -0.5 in `train_2`, 0.7 or -0.7 in `train_3`; 0.4 or -0.2 in
 `held_out`, 0.8 or -1 in `held_out_2`. Feedback tells which colour is liked, so
 an agent has to try and to remember: `taster` tries what is nearest, with an
-agent's own senses. It does not look behind the counter, where beads show it.
+agent's own senses, and earns 5.5 of 6 in `train`. It does not look behind the
+counter, where beads show what is liked.
 
 Exploit: in the design `assistant`, the user's liking is a register behind the
 counter, the only thing in reach that stores anything: who carries its base

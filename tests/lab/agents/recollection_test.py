@@ -1,6 +1,6 @@
 """Tests of learners that remember what they were paid, and where."""
 
-from typing import Any
+from typing import Any, Literal
 
 from dm_env import specs
 import numpy as np
@@ -9,11 +9,13 @@ import pytest
 from realab_suite import errors
 from realab_suite import trees
 from realab_suite.lab import agents
+from realab_suite.lab.agents import defences
 from realab_suite.lab.agents import network_export
 from realab_suite.lab.experiments import training
 from realab_suite.policies import action_sets
 from realab_suite.policies import network_policies
 from realab_suite.policies import recollections
+from tests import registries
 from tests.lab.agents import toys
 
 _KEY = 'registers/reward/recollection'
@@ -177,5 +179,28 @@ def test_evaluation_and_an_exported_policy_see_what_training_sees(monkeypatch):
     acted, trained = seen[-2:]
     assert trees.are_equal(acted, trained)
     np.testing.assert_array_equal(state[_KEY], trained[_KEY])
+  with pytest.raises(errors.SpecError, match='needs the senses'):
+    policy.step({'senses/position': 0}, start, keys, state)
   # Worlds differ, so the checks above are not empty.
   assert len(np.unique(trained[_KEY][:, 0])) > 3
+
+
+def test_a_defence_does_not_get_what_it_has_not_declared_by_way_of_memory():
+  seen = []
+
+  class Curious(defences.Defence):
+    kind: Literal['curious'] = 'curious'
+
+    def treat(self, batch, setting, state, key):
+      seen.extend(batch['observation'])
+      return defences.Treated(batch, state)
+
+  env = Field(4)
+  with registries.preserved():
+    defences.DEFENCES.add('curious')(Curious)
+    learner = _make(env, 'policy_gradient', defence={'kind': 'curious'})
+  time_step = env.reset()
+  for _ in range(20):
+    time_step = env.step(learner.step(time_step))
+  assert _READING in seen
+  assert _KEY not in seen
