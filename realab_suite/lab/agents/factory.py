@@ -16,11 +16,13 @@ from realab_suite.lab.agents import gates
 from realab_suite.lab.agents import guards
 from realab_suite.lab.agents import histories
 from realab_suite.lab.agents import jax_settings
+from realab_suite.lab.agents import lengths
 
 # Class of the wrapper of an option, and the value of the option without one.
 _WRAPPERS: Mapping[str, tuple[Any, Any]] = {
     'frame_stack': (histories.FrameStack, 1),
     'recollection': (histories.Recollection, False),
+    'drest': (lengths.Drest, None),
     'defence': (guards.Guard, None),
     'gate': (gates.Gatekeeper, None),
 }
@@ -58,7 +60,9 @@ def make(
   learner = learner_class(
       # Compiled functions depend on the other options alone.
       options.model_copy(
-          update=dict.fromkeys({'defence', 'gate'} & {*learner_class.WRAPPED})
+          update=dict.fromkeys(
+              {'defence', 'drest', 'gate'} & {*learner_class.WRAPPED}
+          )
       ),
       reading,
       features.Encoder.from_spec(observation_spec, options.frame_stack),

@@ -13,6 +13,7 @@ from realab_suite.config import option_types
 from realab_suite.feedback import objectives
 from realab_suite.lab.agents import base
 from realab_suite.lab.agents import features
+from realab_suite.lab.agents import lengths
 from realab_suite.lab.agents import networks
 from realab_suite.lab.agents import training
 
@@ -31,6 +32,8 @@ class PolicyGradientOptions(training.OnPolicyOptions):
       it is worth what the last observation is, as in an episode without end, or
       `ends` if it is worth nothing, as the evaluation counts it. At
       checkpoints, episodes end as by a time limit.
+    drest: Rewards without a preference between lengths of episodes, see
+      `lengths`; `None` for the readings alone.
     defence: What the learner does about corrupted rewards, a
       `defences.Defence`; `None` for nothing.
   """
@@ -42,6 +45,7 @@ class PolicyGradientOptions(training.OnPolicyOptions):
   entropy: base.Weight = 0.01
   clip: base.Fraction = 0.2
   time_limit: Literal['continues', 'ends'] = 'continues'
+  drest: lengths.DrestOptions | None = None
   defence: Annotated[Any, option_types.ModelIn(objectives.DEFENCES)] | None = (
       None
   )
@@ -62,7 +66,7 @@ class PolicyGradient(training.OnPolicyLearner):
 
   OPTIONS = PolicyGradientOptions
   READS = 'reward'
-  WRAPPED = ('frame_stack', 'recollection', 'defence')
+  WRAPPED = ('frame_stack', 'recollection', 'drest', 'defence')
 
   def _initial_networks(self, generator: np.random.Generator) -> Any:
     hidden, size = self._options.hidden, self._controls.size

@@ -25,7 +25,7 @@ _UNCALLED = 'timeout', 40, 0, 0
 
 def _rows(lengths, eaten=6.0, run='agent', design=_DESIGN, facts=True):
   info = results.RunInfo.of(
-      ('off_switch', 'standard'), (2, None), design, policy=run, run=run,
+      ('unlock_door', 'near'), (1, None), design, policy=run, run=run,
       control_timestep=0.1, max_steps=250,
   )  # fmt: skip
   return [
