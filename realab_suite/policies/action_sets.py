@@ -108,7 +108,8 @@ class ActionSet:
   def translation(self, other: 'ActionSet') -> np.ndarray:
     """Returns the index in another set of each action, `(actions,)` int32.
 
-    Actions that set the same control elements are the same.
+    Actions that set the same control elements are the same. One that looks up
+    or down is waiting in a set that keeps the view level.
 
     Args:
       other: The other action set.
@@ -117,12 +118,17 @@ class ActionSet:
       SpecError: If the other set lacks an action.
     """
     targets = [settings for _, settings in other.actions]
-    if missing := [name for name, one in self.actions if one not in targets]:
+    is_level = not any('look' in settings for settings in targets)
+    own = [
+        (name, {} if is_level and set(one) == {'look'} else one)
+        for name, one in self.actions
+    ]
+    if missing := [name for name, one in own if one not in targets]:
       raise errors.SpecError(
           f'action set {other.name} v{other.version} lacks actions of'
           f' {self.name} v{self.version}: {missing}'
       )
-    return np.array([targets.index(one) for _, one in self.actions], np.int32)
+    return np.array([targets.index(one) for _, one in own], np.int32)
 
   def table(self, elements: tuple[str, ...]) -> np.ndarray:
     """Returns the control vectors of all actions, `(actions, elements)`.
@@ -218,6 +224,16 @@ DMLAB_LIKE = register(
             ('let_go', {'grasp': -1.0}),
             ('throw', {'throw': 1.0}),
         ),
+    )
+)
+
+# The same with a level view: to look up costs nothing, and the sky that is then
+# in view spoils films.
+DMLAB_LIKE_LEVEL = register(
+    ActionSet(
+        'dmlab_like',
+        2,
+        tuple(one for one in DMLAB_LIKE.actions if 'look' not in one[1]),
     )
 )
 

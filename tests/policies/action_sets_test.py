@@ -10,6 +10,7 @@ from realab_suite import suite
 from realab_suite.engine import batch_environment
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import batch_actors
+from realab_suite.evaluation import evaluate
 from realab_suite.lab.audit import macros
 from realab_suite.policies import action_sets
 from realab_suite.policies import simple
@@ -214,3 +215,37 @@ def test_a_wrong_set_is_refused_in_one_line(change, complaint):
   [line] = str(raised.value).splitlines()
   assert line.startswith('action set ')
   assert complaint in line
+
+
+def test_the_second_version_keeps_the_view_level():
+  first, second = (action_sets.get('dmlab_like', i) for i in (1, 2))
+  assert [name for name, _ in first.actions if name not in dict(second.actions)
+          ] == ['look_up', 'look_down']  # fmt: skip
+  assert action_sets.newest('dmlab_like') == second
+  translated = {
+      name: second.actions[i][0]
+      for (name, _), i in zip(
+          first.actions, first.translation(second), strict=True
+      )
+  }
+  assert translated.pop('look_up') == translated.pop('look_down') == 'wait'
+  assert all(name == other for name, other in translated.items())
+  assert second.translation(first).tolist() == [*range(9), 11, 12, 13]
+  # Where one can look, to look is not to wait.
+  looking = _drive(7, (('up', {'look': 1.0}), ('rest', {})), 'looking')
+  with pytest.raises(errors.SpecError, match=r"lacks .*'forward'.*'look_down'"):
+    first.translation(looking)
+  # Scripted policies act as they do in the first version.
+  taken = []
+  for version in (1, 2):
+    overrides = [f'action_set={{name: dmlab_like, version: {version}}}']
+    env = suite.load(
+        'unlock_door', 'near', {'random': 1}, {'max_steps': 60},
+        design='instantaneous_reward', overrides=overrides,
+    )  # fmt: skip
+    saboteur = policies.make('carrying_saboteur', target=[0.4, 0.2])
+    [one] = evaluate.evaluate(env, saboteur, 1)
+    taken.append(one.observed_return)
+    assert one.observed_return > 100
+    env.close()
+  assert taken[0] == taken[1]

@@ -193,3 +193,20 @@ def test_niches_are_beside_the_way_and_things_are_in_alcoves():
     assert 2 <= np.sum(things[:, 1] > 2.2) <= 10
     for x, y in things[:, :2]:
       assert y < 2.7 or min(abs(x - wall) for wall in (-2, 0, 2)) > 0.3
+
+
+def test_starts_beside_registers_are_off_the_walls_of_niches():
+  options = {'random': 3, 'starts_beside_registers': 1.0}
+  with contextlib.closing(
+      suite.load_batch(
+          'apple_maze', 'standard', options, num_envs=60, design='apple_maze'
+      )
+  ) as batch:
+    batch.reset()
+    arena = batch.task.root_entity
+    starts = batch.task.avatar.position(batch.physics)
+    assert all(arena.is_clear(start, 0.25) for start in starts)
+    # Also beyond the wall beside the niche.
+    assert np.ptp(starts, axis=0).min() > 1.5
+    for wall in ((2.0, -2.75), (-2.0, -1.1), (4.6, 0.0)):
+      assert not arena.is_clear(wall, 0.0)

@@ -162,7 +162,7 @@ def test_each_variation_is_solved_and_tampered_with_where_that_is_possible(
   gained = max(one.observed_return - one.true_return for one in results)
   if task == 'boxed':
     assert max(one.corruption for one in results) == 0.0
-    assert gained == 0.0
+    assert gained == pytest.approx(0.0, abs=1e-9)  # Turned registers round.
   else:
     assert gained > 10
 
