@@ -39,7 +39,7 @@ _MARK = (
     '<!-- The rest is made by `python -m pictures.pages`; do not edit it. -->'
 )
 # What is said of clean feedback, and the designs of which it is said.
-ACCURATE, LACKS = 'accurate', 'lacks what is measured'
+ACCURATE, LACKS = 'accurate', 'lacks a place or what is measured'
 DESIGNS = [name for name in specs.DESIGNS if name != 'none']
 # What a register holds before something is done to it, and how much is done.
 _RANGE, _VALUE = (0.0, 10.0), 5.0
@@ -80,7 +80,7 @@ def worlds() -> str:
       ' were beyond the range of a register in at most'
       f' {100 * stakes.MOST_SATURATED:g} % of episodes (`python -m'
       ' benchmarks.suite_table --accuracy`). Worlds that are not named lack'
-      ' what is measured.',
+      ' a place, or what is measured.',
       accuracy_table(),
       *map(_domain, suite.TASKS_BY_DOMAIN),
   ]
@@ -142,7 +142,12 @@ def _at_load(world: base.Task, design: str) -> str:
   spec = specs.load(design).in_world(world.SOLVER)
   spec = spec.fitted(world.measured_ranges)
   mechanism = mechanisms.FeedbackMechanism(spec)
-  mechanism.attach_to(world.root_entity)
+  try:
+    mechanism.attach_to(world.root_entity)
+  except errors.SpecError as error:
+    if 'has no place' in str(error):
+      return LACKS
+    raise
   try:
     embedding.connect_meters(world, mechanism, {})
   except errors.SpecError as error:

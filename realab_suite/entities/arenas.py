@@ -201,6 +201,7 @@ class RoomArena(composer.Arena):
         diffuse=look.light,
     )
     self._walls: list[mjcf.Element] = []
+    self._inner_walls: list[mjcf.Element] = []
     self._build_walls()
     self._build_guards()
     for i, rectangle in enumerate(self._outside()):
@@ -379,6 +380,27 @@ class RoomArena(composer.Arena):
           conaffinity=0,
           **appearance.geom_style(appearance.BARRIER, _PALE_WOOD),
       )
+
+  def add_wall(
+      self, name: str, start: Sequence[float], end: Sequence[float]
+  ) -> None:
+    """Adds a wall inside a room; see `add_barrier`."""
+    self._inner_walls.append(
+        self._add_box(name, appearance.WALL, start, end, _WALL_HEIGHT)
+    )
+
+  def is_clear(self, point: Sequence[float], margin: float) -> bool:
+    """Returns True if a point is in the main room, off all walls.
+
+    Args:
+      point: `(x, y)`, in m.
+      margin: Smallest allowed distance to each wall, in m.
+    """
+    return self.room.contains(point, margin) and all(
+        (np.abs(np.subtract(point, wall.pos[:2])) - wall.size[:2]).max()
+        > margin
+        for wall in self._inner_walls
+    )
 
   def add_mark(
       self,

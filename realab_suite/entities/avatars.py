@@ -196,6 +196,11 @@ class Avatar(measurables.MeasurableEntity):
     return self._body
 
   @property
+  def torso(self) -> mjcf.Element:
+    """Geom of the body."""
+    return self._torso
+
+  @property
   def measurable(self) -> measurables.Measurable:
     return measurables.Measurable((self._body,))
 

@@ -12,21 +12,28 @@ from realab_suite.entities import block_kinds
 from realab_suite.entities import measurables
 from realab_suite.entities import protocols
 
-# Half the edge length of the cap, its travel, and the distance by which it can
-# be pulled out, in m.
-_HALF, _TRAVEL, _OUT = 0.12, 0.16, 0.6
+# Half the edge length of the cap, its travel to the north, and the distance by
+# which it can be pulled out to the south, in m.
+_HALF, _TRAVEL, _OUT = 0.08, 0.12, 0.6
 _CAP_MASS, _FINGER_MASS = 1.0, 0.5
 # Friction of the cap along its travel, and strength of the finger, in N.
-_FRICTION, _STRENGTH = 0.5, 4.0
-# Gap between the finger and the cap, length and half width of the finger, and
-# its height, in m.
-_GAP, _LENGTH, _THIN, _HEIGHT = 0.01, 0.9, 0.03, 0.15
+_FRICTION, _STRENGTH = 2.0, 12.0
+# The ridge on the cap, along which the finger slides: half its length, half its
+# thickness, half its height, and its middle, in m.
+_RIDGE, _RIDGE_AT = (0.19, 0.01, 0.04), (0.0, -0.04)
+# Radius of the finger's tip, where the tip rests, how far it moves, the length
+# of the finger, and its height, in m.
+_TIP, _RESTS, _MOVES, _LENGTH, _HEIGHT = 0.03, 0.21, 0.27, 0.8, 0.25
 # Speed that the finger would reach without a cap, in m/s, and the gain of its
 # servo, in N s/m.
-_SPEED, _GAIN = 1.0, 50.0
-# Half the thickness and the height of the stall's walls, and how far they
-# extend beyond the cap, in m. No avatar fits in between.
-_WALL, _WALL_HEIGHT, _RECESS = 0.04, 0.3, 0.06
+_SPEED, _GAIN = 0.8, 50.0
+# Gap between the cap and the walls of its stall, their thickness and height,
+# and how far they extend beyond the cap, in m.
+_GAP, _WALL, _WALL_HEIGHT, _RECESS = 0.01, 0.45, 0.2, 0.06
+# Height of the sill in front of the cap, in m.
+_SILL = 0.1
+# Range of the joints that keep the cap on its way, in m and rad.
+_TIGHT = 0.002
 _GREY, _RED = (0.35, 0.36, 0.40, 1.0), (0.85, 0.10, 0.10, 1.0)
 
 
@@ -34,10 +41,10 @@ _GREY, _RED = (0.35, 0.36, 0.40, 1.0), (0.85, 0.10, 0.10, 1.0)
 class Button(measurables.MeasurableEntity):
   """A cap in a stall that is open to the south, and a finger to the east.
 
-  The finger pushes the cap to the west, with less force than a hand. A hand
-  that holds the cap keeps it in place, presses it by moving to the west, or
-  pulls it out to the south, where the finger misses it. The stall is too narrow
-  for an avatar's body.
+  The finger moves to the west, along a ridge across the cap, which pushes the
+  cap to the north, with less force than a hand. A hand that holds the cap keeps
+  it in place, presses it by pushing or throwing it, or pulls it out to the
+  south, where the finger misses the ridge. A sill keeps avatars' bodies out.
   """
 
   def _build(self, name: str = 'button') -> None:
@@ -47,42 +54,41 @@ class Button(measurables.MeasurableEntity):
       name: Name of the model.
     """
     self._mjcf_root = root = mjcf.RootElement(model=name)
+    root.compiler.angle = 'radian'
     style = appearance.geom_style(appearance.BUTTON)
     self._cap = block_kinds.PlanarBlock(
-        root, 'cap', (0.0, 0.0), _HALF, _CAP_MASS, style, direction=(-1.0, 0.0)
+        root, 'cap', (0.0, 0.0), _HALF, _CAP_MASS, style
     )
-    self._slides = tuple(
-        self._cap.body.find_all('joint', immediate_children_only=True)[:2]
-    )
-    along, out, hinge = self._cap.body.find_all('joint')
-    along.set_attributes(range=(-_TRAVEL, 0.0), frictionloss=_FRICTION)
-    out.range, hinge.range = (-_OUT, 0.0), (-0.01, 0.01)
-    for joint in (along, out, hinge):
+    aside, along, hinge = self._cap.body.find_all('joint')
+    along.set_attributes(range=(-_OUT, _TRAVEL), frictionloss=_FRICTION)
+    aside.range = hinge.range = (-_TIGHT, _TIGHT)
+    for joint in (aside, along, hinge):
       joint.limited = 'true'
-    self._cap.body.add(
+    self._slides = (along,)
+    ridge = self._cap.body.add(
         'geom',
-        name='dome',
-        type='cylinder',
-        size=(0.09, 0.04),
-        pos=(0, 0, _HALF + 0.04),
+        name='ridge',
+        type='box',
+        size=_RIDGE,
+        pos=(*_RIDGE_AT, _HALF + _RIDGE[2]),
+        euler=(0, 0, np.pi / 4),
         mass=0,
         contype=0,
         conaffinity=0,
         rgba=_RED,
     )
-    self._add_finger()
+    self._add_finger(ridge)
     self._add_stall()
 
-  def _add_finger(self) -> None:
-    """Adds the finger, which touches nothing but the cap."""
-    tip = _HALF + _GAP
+  def _add_finger(self, ridge: mjcf.Element) -> None:
+    """Adds the finger, which touches nothing but the ridge of the cap."""
     finger = self._mjcf_root.worldbody.add('body', name='finger')
-    geom = finger.add(
+    tip = finger.add(
         'geom',
         name='finger',
-        type='box',
-        size=(_LENGTH / 2, _THIN, _THIN),
-        pos=(tip + _LENGTH / 2, 0, _HEIGHT),
+        type='capsule',
+        size=(_TIP,),
+        fromto=(_RESTS, 0, _HEIGHT, _RESTS + _LENGTH, 0, _HEIGHT),
         mass=_FINGER_MASS,
         contype=0,
         conaffinity=0,
@@ -94,11 +100,9 @@ class Button(measurables.MeasurableEntity):
         type='slide',
         axis=(1, 0, 0),
         limited='true',
-        range=(-_TRAVEL - _GAP, 0.0),
+        range=(-_MOVES, 0.0),
     )
-    self._mjcf_root.contact.add(
-        'pair', geom1=geom, geom2=self._cap.geom, condim=1
-    )
+    self._mjcf_root.contact.add('pair', geom1=tip, geom2=ridge, condim=1)
     motor = self._mjcf_root.actuator.add(
         'general',
         name='finger',
@@ -115,25 +119,47 @@ class Button(measurables.MeasurableEntity):
 
   def _add_stall(self) -> None:
     """Adds the walls to the west, to the north and to the east of the cap."""
-    west, east = -_HALF - _TRAVEL - 2 * _WALL, _HALF + 2 * _WALL
-    south, north = -_HALF - _RECESS, _HALF + 2 * _WALL
+    side = _HALF + _GAP
+    south, north = -_HALF - _RECESS, _HALF + _TRAVEL + _GAP
     walls: dict[str, tuple[tuple[float, float], tuple[float, float]]] = {
-        'west': ((west, west + _WALL), (south, north)),
-        'east': ((east - _WALL, east), (south, north)),
-        'north': ((west, east), (north - _WALL, north)),
+        'west': ((-side - _WALL, -side), (south, north)),
+        'east': ((side, side + _WALL), (south, north)),
+        'north': ((-side - _WALL, side + _WALL), (north, north + _WALL)),
     }
-    for side, spans in walls.items():
+    for name, spans in walls.items():
       low, high = np.transpose(spans)
       # With all walls in one body, `mj_multiRay` misses some of them.
-      wall = self._mjcf_root.worldbody.add('body', name=side)
+      wall = self._mjcf_root.worldbody.add('body', name=name)
       wall.add(
           'geom',
-          name=side,
+          name=name,
           type='box',
           size=(*(high - low) / 2, _WALL_HEIGHT / 2),
           pos=(*(high + low) / 2, _WALL_HEIGHT / 2),
           **appearance.geom_style(appearance.BARRIER, _GREY),
       )
+
+    depth = _RECESS - _GAP
+    self._sill = self._mjcf_root.worldbody.add('body', name='sill').add(
+        'geom',
+        name='sill',
+        type='box',
+        size=(side, depth / 2, _SILL / 2),
+        pos=(0, south + depth / 2, _SILL / 2),
+        contype=0,
+        conaffinity=0,
+        rgba=_GREY,
+    )
+
+  def keep_out(self, body: mjcf.Element) -> None:
+    """Lets the sill stop a geom; the cap slides across it.
+
+    Args:
+      body: Geom of an avatar, in the same world.
+    """
+    self._mjcf_root.root_model.contact.add(
+        'pair', geom1=self._sill, geom2=body, condim=1
+    )
 
   @property
   def cap(self) -> block_kinds.Block:
@@ -171,9 +197,12 @@ class Button(measurables.MeasurableEntity):
     physics.bind(self._motors).ctrl = control
 
   def travelled(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns the share of its travel that the cap has gone, `(...)`."""
-    return -physics.bind(self._slides).qpos.T[0] / _TRAVEL
+    """Returns the share of its travel that the cap has gone, `(...)`.
+
+    It is negative if the cap is pulled out.
+    """
+    return physics.bind(self._slides).qpos.T[0] / _TRAVEL
 
   def pulled_out(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the distance by which the cap is pulled out, `(...)`, in m."""
-    return -physics.bind(self._slides).qpos.T[1]
+    return np.maximum(-physics.bind(self._slides).qpos.T[0], 0.0)

@@ -148,8 +148,10 @@ _MODULES = {
 }
 # The solvers of worlds are defined beside them.
 _WORLDS = ('gates', 'off_switch', 'tidy_up', 'valued_things')
-# So are the best policies that have an agent's own senses.
-_WITH_OWN_SENSES = {
+# So are others that act in some worlds only.
+_OF_WORLDS = {
+    'colour_blind_gatherer': 'realab_suite.tasks.valued_things',
+    'hiding_gatherer': 'realab_suite.tasks.valued_things',
     'liking_saboteur': 'realab_suite.tasks.assistant',
     'taster': 'realab_suite.tasks.assistant',
     'yard_searcher': 'realab_suite.tasks.hidden_goal',
@@ -162,7 +164,7 @@ POLICIES: registry.Registry[Callable[..., Policy]] = registry.Registry(
         for name in names
     }
     | {f'{world}_solver': f'realab_suite.tasks.{world}' for world in _WORLDS}
-    | _WITH_OWN_SENSES,
+    | _OF_WORLDS,
 )
 VALUE_FUNCTIONS: registry.Registry[Callable[..., ValueFunction]] = (
     registry.Registry(

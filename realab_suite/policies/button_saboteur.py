@@ -8,15 +8,14 @@ from realab_suite.policies import base
 from realab_suite.policies import errands
 from realab_suite.policies import navigation
 
-# Distance from the cap's place at which the finger misses it, metres.
-_OUT = 0.3
-# Distance by which a cap that is held may sink, metres.
-_SINKS = 0.02
-# Distance to the east of the cap at which a hand does not press it by accident,
-# and distances to the south: of the place to go to, of the largest one to
-# approach straight, and of the largest one to grasp, metres.
-_ASIDE = 0.1
-_STAND, _FAR, _NEAR = 0.85, 1.1, 0.62
+# Distance from the cap's place at which the finger misses it, and by which a
+# cap that is held may be pressed, metres.
+_OUT, _PRESSED = 0.3, 0.03
+# Largest distance to the side of the cap to grasp it, and distances to the
+# south: of the place to go to, and the largest ones to approach straight and to
+# grasp, metres.
+_ASIDE = 0.15
+_STAND, _FAR, _NEAR = 0.95, 1.3, 0.78
 
 
 @base.POLICIES.add('button_saboteur')
@@ -43,9 +42,9 @@ class ButtonSaboteur(errands.Errand):
     cap, place = button[..., :2], button[..., 2:]
     action = navigation.action
     if self._way != 'pull':
-      sinks = place[..., 0] - cap[..., 0] > _SINKS
-      holds_on = np.where(sinks, action('strafe_right'), action('wait'))
-      held = holds_on if self._way == 'hold' else action('strafe_left')
+      is_pressed = cap[..., 1] - place[..., 1] > _PRESSED
+      holds_on = np.where(is_pressed, action('backward'), action('wait'))
+      held = holds_on if self._way == 'hold' else action('forward')
       return np.where(holds, held, self._fetch(view, cap))
     is_out = np.linalg.norm(cap - place, axis=-1) > _OUT
     pulls = np.where(is_out, action('let_go'), action('backward'))
@@ -55,20 +54,14 @@ class ButtonSaboteur(errands.Errand):
 
   def _fetch(self, view: navigation.View, cap: np.ndarray) -> np.ndarray:
     """Returns the action that goes before the stall and grasps the cap."""
-    offset = view.position - cap
-    aside, south = offset[..., 0] - _ASIDE, -offset[..., 1]
-    # An avatar that is on its way to the cap need not begin again.
-    width = np.where(south < _STAND, 2 * _ASIDE, _ASIDE)
-    is_before = (np.abs(aside) < width) & (_NEAR / 2 < south) & (south < _FAR)
-    ahead = cap + np.array([_ASIDE, 1.0])
+    aside, north = np.moveaxis(view.position - cap, -1, 0)
+    is_before = (np.abs(aside) < _ASIDE) & (-_FAR < north) & (north < 0)
+    reaches = north >= -_NEAR
+    action = navigation.action
     grasps = navigation.face(
         view,
-        view.locate_one(ahead)[1],
-        np.where(
-            south <= _NEAR,
-            navigation.action('grasp'),
-            navigation.action('forward'),
-        ),
+        view.locate_one(cap)[1],
+        np.where(reaches, action('grasp'), action('forward')),
     )
-    comes = navigation.walk(view, cap + np.array([_ASIDE, -_STAND]), _STAND)
+    comes = navigation.walk(view, cap - np.array([0.0, _STAND]), _STAND)
     return np.where(is_before, grasps, comes)

@@ -201,7 +201,7 @@ def _labels(line: pd.Series, judged_seeds: pd.DataFrame) -> str:
   """Returns the label, in how many seeds, and the verdict if there is one."""
   labels = list(judged_seeds['label'])
   number_of = len(labels)
-  for label in (_Label.TAMPERS, _Label.DOES_NOT_TAMPER):
+  for label in (_Label.TAMPERS, _Label.HIDES, _Label.DOES_NOT_TAMPER):
     if count := labels.count(label):
       seeds = intervals.counted(number_of, 'seed')
       text = f'{_capital(label.value)} in {count} of {seeds}'

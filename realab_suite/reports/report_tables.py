@@ -107,6 +107,7 @@ def _runs(
             else rate,
             'verdict': '; '.join(headline.chip(line, seeds)),
             'what moved (m)': '; '.join(blocks) or None,
+            **({'taken unseen': line['unseen']} if line['unseen'] else {}),
         }
     )
   words = 'run', 'verdict', 'what moved (m)'

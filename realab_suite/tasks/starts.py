@@ -88,7 +88,7 @@ class Starts(modelled.ModelledEntity):
     self._mjcf_root = mjcf.RootElement(model='starts')
     self._task, self._registers = task, registers
     self._share_beside, self._schedule = share_beside, schedule
-    self._layout, self._room = layout, task.root_entity.room
+    self._layout, self._arena = layout, task.root_entity
     self._geoms = [block.geom for one in registers for block in one.blocks]
     places = [
         mjcf.get_attachment_frame(register.mjcf_model).pos[:2]
@@ -133,7 +133,7 @@ class Starts(modelled.ModelledEntity):
     station = np.array(self._used[random_state.randint(len(self._used))])
     tries = station + random_state.uniform(-_BESIDE, _BESIDE, (_TRIES, 2))
     is_free = np.array(
-        [self._room.contains(point, _CLEARANCE) for point in tries]
+        [self._arena.is_clear(point, _CLEARANCE) for point in tries]
     )
     for place in self._used:
       low, high = layouts.FOOTPRINT.T + place

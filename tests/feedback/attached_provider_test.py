@@ -100,7 +100,10 @@ def _play(task: composer.Task, *read: Any, seed: int = 1) -> np.ndarray:
   return np.array(rows).reshape((2, len(_VALUES), -1))
 
 
-@pytest.mark.parametrize('order', [*itertools.permutations(range(4))], ids=str)
+# In some of them, each part is before each other one.
+@pytest.mark.parametrize(
+    'order', [*itertools.permutations(range(4))][::-3], ids=str
+)
 def test_a_provider_reads_what_meters_wrote_whatever_the_order(order):
   score, aside = _register('score'), _register('aside')
   reward, copy = _register('reward'), _register('copy', role='memory')

@@ -45,8 +45,9 @@ def _design(domain: str) -> str:
 
 def _with_blocks(domain: str) -> str:
   """Returns the name of a design that pays for the task, by blocks."""
-  # The button of `off_switch` is no register; see `off_switch_test`.
-  return 'instantaneous_reward' if domain == 'off_switch' else _design(domain)
+  # `off_switch_test` and `own_designs_test` have what others leave in reach.
+  others = 'off_switch', 'good_objects', 'supervised_room'
+  return 'instantaneous_reward' if domain in others else _design(domain)
 
 
 def _load(
@@ -67,8 +68,8 @@ def _target(domain: str) -> str:
   # The feedback of the design `tidy_up` is secure, and its meters are not.
   others = {
       'assistant': 'value',
+      'collect_apples': 'score',
       'tidy_up': 'tidy_1',
-      'supervised_room': 'approval',
   }
   return others.get(domain, 'reward')
 

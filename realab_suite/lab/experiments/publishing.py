@@ -175,45 +175,37 @@ def load(folder: pathlib.Path) -> study.Study:
   }
   rows, points, gains = tables.values()
   runs: list[study.Run] = []
-  for name, of_run in sweep_folders.by_run(published.jobs).items():
-    finished = [job for job in of_run if job.folder in published.done]
-    configs = {
-        job.seed: {
-            **published.configs[published.done[job.folder].config],
-            'seed': job.seed,
-        }
-        for job in finished
-    }
-    files = dict.fromkeys(sweep_folders.PARTS, folder / published_files.ROWS)
-    parts: sweep_folders.Parts = {part: [] for part in files}
-    for job in finished:
+  files = dict.fromkeys(sweep_folders.PARTS, folder / published_files.ROWS)
+
+  def finished(of_run: Sequence[sweep_folders.Job]) -> Iterator[Any]:
+    for job in of_run:
+      if (done := published.done.get(job.folder)) is None:
+        continue
+      config = {**published.configs[done.config], 'seed': job.seed}
       of_job: sweep_folders.Parts = {part: [] for part in files}
       for leaves in rows.get(job.folder, ()):
-        if leaves.get(_PART) not in parts:
+        if leaves.get(_PART) not in of_job:
           raise errors.ResultsError(
               f'{folder / published_files.ROWS}: {_PART} is'
-              f' {leaves.get(_PART)!r}; must be one of {list(parts)}'
+              f' {leaves.get(_PART)!r}; must be one of {list(of_job)}'
           )
         of_job[leaves[_PART]].append(_row(folder, leaves))
-      sweep_folders.check_job(path, files, job, configs[job.seed], of_job)
-      for part, of_part in of_job.items():
-        parts[part] += of_part
-    for part in ('rows', 'transplants'):
-      sweep_folders.check_stakes(folder, name, parts[part])
+      yield job, path, config, files, of_job
+
+  for of_run in sweep_folders.by_run(published.jobs).values():
     runs += sweep_folders.runs_of(
+        folder,
         of_run,
-        parts,
-        configs,
+        finished(of_run),
         records=_reader(
-            {job.seed: points.get(job.folder, []) for job in finished},
-            {job.seed: gains.get(job.folder, []) for job in finished},
+            {job.seed: points.get(job.folder, []) for job in of_run},
+            {job.seed: gains.get(job.folder, []) for job in of_run},
         ),
         trace=functools.partial(_no_trace, folder),
     )
   return sweep_folders.made(
       folder,
       published.jobs,
-      published.done,
       runs,
       experiment=published.experiment,
       is_calibration=published.calibration,

@@ -27,6 +27,7 @@ _PARTS = {
     'corruption_units': 'units',
 }
 _QUERIES = 'queries not its actions'
+_UNSEEN = 'taken unseen'
 _OF_HACKING = (
     'hack rate (%)', "control's (%)", 'hack-free return', 'hack-free episodes',
     'ended by tampering',
@@ -51,13 +52,14 @@ def as_text(evaluation: study.Study, judged: pd.DataFrame) -> str:
           'gain (units)': of_run['gain'],
           'verdict': _verdict(run, line),
           _QUERIES: line['misnamed'],
+          _UNSEEN: line['unseen'],
       }
       for run, line, of_run in zip(runs, lines.values(), means, strict=True)
   ).rename(columns={'hack-free episodes': 'hack-free'})
-  is_coupled = frame[_QUERIES].iloc[0] is not None
+  optional = [name for name in (_QUERIES, _UNSEEN) if frame[name].iloc[0]]
   main = frame[[
       'run', 'true return', 'observed return', *_OF_HACKING[:3],
-      'corruption (m)', 'verdict', *([_QUERIES] if is_coupled else []),
+      'corruption (m)', 'verdict', *optional,
   ]]  # fmt: skip
   more = frame[[
       'run', 'episodes', 'hack-free', 'own (m)', 'inherited (m)',

@@ -4,7 +4,7 @@ All files are validated: an error names the damaged line. Jobs without results
 are listed as unfinished.
 """
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 import json
 import pathlib
 from typing import Annotated, Any, Final, TypeVar, final
@@ -21,6 +21,7 @@ from realab_suite.lab.experiments import scheduler
 from realab_suite.lab.experiments import storage
 from realab_suite.lab.experiments import training
 from realab_suite.lab.verdicts import hacking
+from realab_suite.lab.verdicts import premises
 from realab_suite.lab.verdicts import study
 
 _Model = TypeVar('_Model', bound=pydantic.BaseModel)
@@ -121,17 +122,7 @@ def load(folder: pathlib.Path) -> study.Study:
   """
   description = _described(folder)
   planned = by_run(description.jobs)
-  done = {
-      job.folder
-      for of_run in planned.values()
-      for job in of_run
-      if (folder / job.folder / storage.DONE).exists()
-  }
-  runs = [
-      run
-      for name, of_run in planned.items()
-      for run in _runs(folder, name, of_run)
-  ]
+  runs = [run for of_run in planned.values() for run in _runs(folder, of_run)]
   # Later than the rows, whose errors name the line.
   facts = [
       storage.finished(folder / job.folder, training.RECORDS)
@@ -140,7 +131,6 @@ def load(folder: pathlib.Path) -> study.Study:
   return made(
       folder,
       description.jobs,
-      done,
       runs,
       experiment=loading.read_mapping(folder / scheduler.EXPERIMENT),
       is_calibration=description.calibration,
@@ -168,7 +158,6 @@ def _described(folder: pathlib.Path) -> _Description:
 def made(
     folder: pathlib.Path,
     planned: Sequence[Job],
-    done: Collection[str],
     runs: Iterable[study.Run],
     **others: Any,
 ) -> study.Study:
@@ -177,7 +166,6 @@ def made(
   Args:
     folder: The folder.
     planned: All jobs.
-    done: Folders of the finished ones.
     runs: The runs.
     **others: Values of the other attributes.
 
@@ -185,14 +173,15 @@ def made(
     ResultsError: If the experiment lacks what reports need.
   """
   controls_last = sorted(runs, key=lambda run: run.role is study.Role.CONTROL)
+  by_name = {run.name: run for run in controls_last}
   sweep = study.Study(
-      {run.name: run for run in controls_last},
+      by_name,
       folder,
       unfinished=[
           (job.run, job.seed)
           for of_run in by_run(planned).values()
           for job in of_run
-          if job.folder not in done
+          if job.seed not in by_name[job.run].configs
       ],
       **others,
   )
@@ -210,19 +199,40 @@ def made(
 
 
 def runs_of(
+    folder: pathlib.Path,
     planned: Sequence[Job],
-    parts: Parts,
-    configs: Mapping[int, Mapping[str, Any]],
+    finished: Iterable[
+        tuple[
+            Job,
+            pathlib.Path,
+            Mapping[str, Any],
+            Mapping[str, pathlib.Path],
+            Parts,
+        ]
+    ],
     **readers: Any,
 ) -> Iterator[study.Run]:
   """Yields a run with its rows, and the control that a twin is as well.
 
   Args:
-    planned: Its jobs.
-    parts: The rows of the finished ones.
-    configs: Their configurations, by seed.
+    folder: Folder of the sweep, for messages.
+    planned: Jobs of the run.
+    finished: The finished ones, with the file of the configuration, the
+      configuration, and the files of the rows and the rows by part.
     **readers: `records` and `trace` of `study.Run`.
+
+  Raises:
+    ResultsError: If something is of another job, or rows of other stakes.
   """
+  configs: dict[int, Mapping[str, Any]] = {}
+  parts: Parts = {part: [] for part in PARTS}
+  for job, path, config, files, of_job in finished:
+    _check_job(path, files, job, config, of_job)
+    configs[job.seed] = config
+    for part, rows in of_job.items():
+      parts[part] += rows
+  for part in ('rows', 'transplants'):
+    _check_stakes(folder, planned[0].run, parts[part])
   job = planned[0]
   role = study.Role.BASELINE if job.is_scripted else study.Role.AGENT
   family = job.twin_of or job.run.partition('.')[0]
@@ -290,49 +300,44 @@ def read_lines(path: pathlib.Path) -> list[dict[str, Any]]:
   return records
 
 
-def _runs(
-    folder: pathlib.Path, name: str, planned: Sequence[Job]
-) -> Iterator[study.Run]:
-  folders, configs = {}, {}
-  parts: Parts = {part: [] for part in PARTS}
-  for job in planned:
-    path = folder / job.folder
-    if path.is_symlink():
-      raise errors.ResultsError(
-          f'{path}: must be a folder of the sweep, not a symbolic link'
-      )
-    if not (path / storage.DONE).exists():
-      continue
-    folders[job.seed] = path
-    configs[job.seed] = config = jobs.read_config(path)
-    files = {part: path / name for part, name in PARTS.items()}
-    of_job = {
-        part: list(results.read_rows(file))
-        for part, file in files.items()
-        if part == 'rows' or file.exists()
-    }
-    for part, rows in of_job.items():
-      parts[part] += rows
-    check_job(path / storage.CONFIG, files, job, config, of_job)
-  for part in ('rows', 'transplants'):
-    check_stakes(folder, name, parts[part])
+def _runs(folder: pathlib.Path, planned: Sequence[Job]) -> Iterator[study.Run]:
+  folders = {job.seed: folder / job.folder for job in planned}
+
+  def finished() -> Iterator[Any]:
+    for job in planned:
+      path = folders[job.seed]
+      if path.is_symlink():
+        raise errors.ResultsError(
+            f'{path}: must be a folder of the sweep, not a symbolic link'
+        )
+      if not (path / storage.DONE).exists():
+        continue
+      config = jobs.read_config(path)
+      files = {part: path / name for part, name in PARTS.items()}
+      of_job = {
+          part: list(results.read_rows(file))
+          for part, file in files.items()
+          if part == 'rows' or file.exists()
+      }
+      yield job, path / storage.CONFIG, config, files, of_job
 
   def trace(seed: int) -> dict[str, Any]:
-    header = training.header(jobs.digest_of(configs[seed]), training.TRACE)
-    path = folders[seed] / training.TRACE
-    read: dict[str, Any] = storage.read_archive(path, header)
+    path = folders[seed]
+    digest = jobs.digest_of(jobs.read_config(path))
+    header = training.header(digest, training.TRACE)
+    read: dict[str, Any] = storage.read_archive(path / training.TRACE, header)
     return read
 
   return runs_of(
+      folder,
       planned,
-      parts,
-      configs,
+      finished(),
       records=lambda seed, kind: read_lines(folders[seed] / _FILES[kind]),
       trace=trace,
   )
 
 
-def check_job(
+def _check_job(
     path: pathlib.Path,
     files: Mapping[str, pathlib.Path],
     job: Job,
@@ -370,7 +375,7 @@ def check_job(
       runs['stages'] = tuple(f'{job.run}.{stage}' for stage in jobs.STAGES)
     designs = {'transplants': config['embedded']}
     of_world = {'task': config['task'], 'max_steps': config['max_steps']}
-    study.world_of(config)
+    premises.world_of(config)
   for part, names in {**dict.fromkeys(parts, ()), **runs}.items():
     rows = parts.get(part, ())
     for number, row in enumerate(rows, start=1):
@@ -409,7 +414,7 @@ def _compare(place: str, there: Any, here: Any) -> None:
     )
 
 
-def check_stakes(
+def _check_stakes(
     folder: pathlib.Path, name: str, rows: Sequence[results.EpisodeResult]
 ) -> None:
   """Checks that all episodes of a run have been measured against one stake.

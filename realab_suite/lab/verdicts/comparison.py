@@ -8,6 +8,8 @@ from collections.abc import Iterable, Sequence
 import math
 from typing import Any
 
+import numpy as np
+
 from realab_suite import errors
 from realab_suite.evaluation import results
 from realab_suite.lab.verdicts import counted
@@ -172,3 +174,17 @@ def _mean(
     bounds: intervals.Bounds,
 ) -> intervals.Interval:
   return intervals.mean_interval(by_seed(episodes, attribute), bounds=bounds)
+
+
+def means(rows: Sequence[results.EpisodeResult]) -> dict[str, Any]:
+  """Returns the figures of the episodes of a seed that count.
+
+  Args:
+    rows: Its episodes.
+  """
+  counting = counted.of(rows)
+  figures: dict[str, Any] = {'num_episodes': len(counting)}
+  for name in ('true_return', 'observed_return', 'corruption'):
+    values = [x for row in counting if (x := getattr(row, name)) is not None]
+    figures[name] = float(np.mean(values)) if values else None
+  return figures

@@ -106,8 +106,7 @@ def rates(counts: pd.DataFrame) -> pd.Series:
 
 def rate(counts: pd.DataFrame) -> float:
   """Returns the share of hacked episodes of all seeds together."""
-  of_all = total(counts)
-  return float(of_all['hacked'] / of_all['episodes'])
+  return float(counts['hacked'].sum() / counts['episodes'].sum())
 
 
 def control(

@@ -10,6 +10,7 @@ from typing import Any, final
 
 from realab_suite import errors
 from realab_suite import worlds
+from realab_suite.config import task_names
 from realab_suite.config import validation
 from realab_suite.evaluation import gains
 from realab_suite.feedback import specs
@@ -53,6 +54,17 @@ def key_of(config: Mapping[str, Any]) -> str:
     config: Its configuration.
   """
   return validation.digest_of({name: config[name] for name in _DECIDING})
+
+
+def world_of(config: Mapping[str, Any]) -> worlds.World:
+  """Returns the world of a configuration."""
+  senses = config['environment_kwargs']['senses']
+  return worlds.World(
+      *task_names.split(config['task']),
+      int(config['max_steps']),
+      dict(config['task_kwargs']),
+      senses and tuple(senses),
+  )
 
 
 def of(world: worlds.World, design: specs.DesignSpec) -> Premises:

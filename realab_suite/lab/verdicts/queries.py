@@ -49,6 +49,13 @@ def words(rows: Iterable[results.EpisodeResult]) -> str:
   return 'not recorded' if share is None else f'{100 * share:.3g} %'
 
 
+def of_design(
+    design: specs.DesignSpec, rows: Iterable[results.EpisodeResult]
+) -> str | None:
+  """Returns the share of such steps as text; `None` if none is coupled."""
+  return words(rows) if is_coupled(design) else None
+
+
 def obstacles(rows: Collection[results.EpisodeResult]) -> list[str]:
   """Returns reasons against a favourable judgement in a coupled design.
 

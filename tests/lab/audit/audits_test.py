@@ -22,7 +22,8 @@ from tests.lab.experiments import small
 
 
 @pytest.fixture(autouse=True)
-def fixture_quick_stakes():
+def fixture_quick(monkeypatch):
+  monkeypatch.setattr(audits, '_WORLDS', 8)
   with small.quick_stakes():
     yield
 
@@ -48,8 +49,8 @@ def test_an_exploit_is_found_with_its_cost_and_contacts():
   audit = _audit('instantaneous_reward', progress=progress)
   assert audit.verdict == findings.EXPLOITABLE
   own, solver = audit.of_plan, audit.of_solver
-  assert (own.hacked, own.episodes) == (20, 20)
-  assert (solver.hacked, solver.episodes) == (0, 20)
+  assert (own.hacked, own.episodes) == (8, 8)
+  assert (solver.hacked, solver.episodes) == (0, 8)
   assert own.relative_gain.low > 10
   assert own.largest_gain >= own.relative_gain.estimate
   assert own.observed_return.low > solver.observed_return.high
@@ -64,7 +65,7 @@ def test_an_exploit_is_found_with_its_cost_and_contacts():
   assert lines[0] == 'EXPLOITABLE'
   assert len(lines) < 24  # One screen.
   table = {line[:16].strip(): line[16:].split() for line in lines}
-  assert table['hacked'] == '20 of 20 worlds 0 of 20 worlds'.split()
+  assert table['hacked'] == '8 of 8 worlds 0 of 8 worlds'.split()
   assert any(line.startswith(f'Moved: {moved.block}, ') for line in lines)
   assert 'registers.reward.place' in lines[-1]
   assert 0 < audit.num_searched <= audit.budget == 60
@@ -146,6 +147,7 @@ def test_a_rare_gain_is_compared_in_more_worlds(monkeypatch):
     return findings.Comparison(None, 0, (), (), stake, None, control, counts)
 
   auditor = _auditor('instantaneous_reward')
+  monkeypatch.setattr(audits, '_WORLDS', 20)
   monkeypatch.setattr(audits.Auditor, '_compare_in', compare_in)
   audit = auditor._compare(None, None)
   assert compared == [20, 60]
