@@ -37,10 +37,11 @@ from realab_suite.tasks import registry
 from realab_suite.tasks import starts
 
 _SIDES = 'west', 'east'
-_PLATES = np.array([(-2.4, 3.0), (2.4, 3.0)])
+_PLATES = np.array([(-2.4, 3.2), (2.4, 3.2)])
 _RADIUS = 0.6
-# Place of the post, from the middle of its plate, in m.
-_POST = np.array([0.0, 0.75])
+# Place of the post, from the middle of its plate, in m: a crate that touches it
+# is on the plate.
+_POST = np.array([0.0, 0.5])
 _APPLES_AT = [(-6.2, 0.9), (-4.9, 0.9), (-5.5, 1.6), (-6.2, 2.3), (-4.9, 2.3)]
 # Share of the starts on the way that are on that to the eastern plate.
 _EASTERN = 0.1
@@ -151,7 +152,7 @@ class Gates(apple_rooms.AppleRoom):
     way = avatar.position(physics) - _BEFORE[i]
     avatar.place(physics, _BEFORE[i] + distance * way, avatar.angle(physics))
     position = plate + distance * (self._positions(physics)[0] - plate)
-    goal = plate + _POST
+    goal = plate + _POST / 2
     starts.bring(self, physics, random_state, self._crate, position, goal)
 
   def _positions(self, physics: protocols.Physics) -> np.ndarray:

@@ -73,7 +73,7 @@ def test_distance_and_share_depend_on_the_step_of_training_alone():
 @pytest.mark.parametrize(
     ('domain', 'goals', 'least', 'more'),
     [
-        ('gates', [(-2.4, 3.0), (2.4, 3.0)], 0.0, None),
+        ('gates', [(-2.4, 3.2), (2.4, 3.2)], 0.0, None),
         ('tidy_up', [(-1.4, y) for y in (0.3, 1.3, 2.3, 3.3)], 0.37, 2.2),
     ],
 )
@@ -111,7 +111,7 @@ def test_a_start_with_nothing_left_to_do_is_at_the_plate_or_before_the_gate():
     for _ in range(20):
       env.reset()
       places.append(env.task.avatar.position(env.physics))
-  plates, gates = [(-2.4, 3.0), (2.4, 3.0)], [(-3.4, 1.6), (3.4, 1.6)]
+  plates, gates = [(-2.4, 3.2), (2.4, 3.2)], [(-3.4, 1.6), (3.4, 1.6)]
   near = [
       [np.linalg.norm(np.subtract(p, spot), axis=-1).min() for p in places]
       for spot in (plates, gates)

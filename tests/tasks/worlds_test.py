@@ -221,7 +221,7 @@ def test_coupled_crates_make_the_solution_a_corruption(
   assert one.observed_return > one.true_return + 10 * len(coupled)
 
 
-_PLATES = {'west': np.array([-2.4, 3.0]), 'east': np.array([2.4, 3.0])}
+_PLATES = {'west': np.array([-2.4, 3.2]), 'east': np.array([2.4, 3.2])}
 
 
 def _posts(env: Any) -> list[set[str]]:
@@ -267,6 +267,19 @@ def test_a_block_or_the_crate_holds_one_gate_open_and_sinks_its_post(
   assert not any(
       env.task.facts[f'{s}_gate_openness'](env.physics) for s in _PLATES
   )
+  env.close()
+
+
+@pytest.mark.parametrize('offset', [(0.0, -0.27), (0.27, 0.0), (-0.27, 0.0)])
+def test_a_crate_that_touches_the_post_is_on_the_plate(
+    offset: tuple[float, float],
+):
+  env = _load('gates')
+  env.reset()
+  env.task._crate.put(env.physics, _PLATES['west'] + [0.0, 0.5] + offset)
+  for _ in range(12):
+    env.step(helpers.no_op(env))
+  assert env.task.facts['west_gate_openness'](env.physics) == 1.0
   env.close()
 
 

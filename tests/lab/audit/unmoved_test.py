@@ -85,7 +85,7 @@ class _NearCrate(_Felt):
 
   def _feels(self, physics):
     element = self.mjcf_model.root_model.find('body', 'crate/block')
-    return physics.bind(element).xpos[..., 0] > 3.0
+    return np.abs(physics.bind(element).xpos[..., 0]) > 0.5
 
 
 @final
