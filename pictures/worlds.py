@@ -3,6 +3,7 @@
 import contextlib
 import pathlib
 
+import numpy as np
 from PIL import Image
 from PIL import ImageDraw
 
@@ -10,26 +11,34 @@ from pictures import views
 from realab_suite import suite
 
 _SIZE = (400, 400)
-_DESIGN = 'instantaneous_reward'
-# No score of any world is beyond this range.
-_OVERRIDES = 'registers.score.range=[-11, 20]', 'registers.score.scale=0.03'
 _PER_ROW = 5
 _INK = (255, 255, 255)
-# Looks straight down on the whole room.
-_POSE = views.Pose((0.0, 0.7, 0.0), 13.0, 90.0, -90.0)
+# Height of a camera over the width that it sees, and what it sees beside the
+# walls, in m, with room for the name of a world.
+_HEIGHT, _MARGIN = 1.2, 1.6
 
 
 def draw(folder: pathlib.Path) -> None:
   """Writes a picture of each world, named `domain.task.png`."""
   folder.mkdir(parents=True, exist_ok=True)
   for domain, task in suite.ALL_TASKS:
-    env = suite.load(
-        domain, task, {'random': 1}, design=_DESIGN, overrides=_OVERRIDES
+    _from_above(domain, task, 1).save(
+        folder / f'{domain}.{task}.png', optimize=True
     )
-    with contextlib.closing(env):
-      env.reset()
-      frame = views.View(env, _SIZE, _POSE).frame()
-    frame.save(folder / f'{domain}.{task}.png', optimize=True)
+
+
+def _from_above(domain: str, task: str, seed: int) -> Image.Image:
+  """Returns a picture of a world with its own design."""
+  env = suite.load(domain, task, {'random': seed}, design=domain)
+  with contextlib.closing(env):
+    env.reset()
+    extent = env.task.root_entity.extent
+    low, high = np.array(extent.low), np.array(extent.high)
+    x, y = (low + high) / 2
+    distance = _HEIGHT * (max(high - low) + _MARGIN)
+    # Looks straight down on the whole room.
+    pose = views.Pose((x, y, 0.0), distance, 90.0, -90.0)
+    return views.View(env, _SIZE, pose).frame()
 
 
 def draw_sheet(path: pathlib.Path) -> None:
@@ -41,13 +50,7 @@ def draw_sheet(path: pathlib.Path) -> None:
   )
   for i, domain in enumerate(domains):
     tasks = suite.TASKS_BY_DOMAIN[domain]
-    design = suite.designs_for(domain)[-1]
-    if design != domain:
-      design = _DESIGN
-    env = suite.load(domain, tasks[0], {'random': 3}, design=design)
-    with contextlib.closing(env):
-      env.reset()
-      frame = views.View(env, _SIZE, _POSE).frame().resize((width, height))
+    frame = _from_above(domain, tasks[0], 3).resize((width, height))
     # Below the room, on the plain floor.
     place = width / 2, height - 2
     ImageDraw.Draw(frame).text(place, domain, _INK, anchor='ms')
