@@ -54,7 +54,7 @@ def accuracy(domain: str, task: str) -> Cells:
   The solver and random actions play the twin of each design that loads.
   """
   cells = {}
-  for design in pages.DESIGNS:
+  for design in suite.designs_for(domain):
     options = {'design': design, 'overrides': ['channel=secure']}
     try:
       batch = suite.load_batch(

@@ -116,7 +116,9 @@ def accuracy_table() -> str:
 def accuracies(domain: str) -> dict[str, dict[str, list[str]]]:
   """Returns tasks by what is said on their clean feedback, by design."""
   at_load: dict[Any, str] = {}
-  said: dict[str, dict[str, list[str]]] = {design: {} for design in DESIGNS}
+  said: dict[str, dict[str, list[str]]] = {
+      design: {} for design in suite.designs_for(domain) if design != 'none'
+  }
   for task in suite.TASKS_BY_DOMAIN[domain]:
     row = figures().get(f'{domain}.{task}', {})
     world = registry.find(domain, task)()

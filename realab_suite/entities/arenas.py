@@ -568,7 +568,7 @@ _OPPOSITE = {'south': 'north', 'west': 'east', 'east': 'west', 'north': 'south'}
 _Sides = Mapping[str, tuple[str, str, str, float]]
 
 
-class _Hall(RoomArena):
+class _Hall(RoomArena, abc.ABC):
   """A large room with doorways to small rooms."""
 
   # By the side of the small room: first part of the names of its walls, names

@@ -1,7 +1,7 @@
 """Detectors see registers that were moved, if they are in sight.
 
 The room has a supervisor at (-3.5, 1.2) that looks to the east, and a screen of
-0.5 m at x = 1.3, from y = 0.9 to 2.7. A block is pushed by 5 cm to the north.
+0.5 m at x = -1.2, from y = 0.5 to 2.1. A block is pushed by 5 cm to the north.
 """
 
 from typing import Any
@@ -16,7 +16,7 @@ from tests.feedback import metered
 
 _WORLD = 'supervised_room', 'standard'
 _EYES: dict[str, Any] = {'eye': 'supervisor'}
-_OPEN, _HIDDEN = [0.0, 1.2], [2.4, 1.8]
+_OPEN, _HIDDEN = [-2.2, 1.2], [-0.1, 1.3]
 
 
 def _design(
@@ -57,16 +57,16 @@ def _push(env: Any, by: Any = 0.05, block: int = 0) -> None:
 _SIGHTS: dict[str, tuple[Any, Any, bool]] = {
     'everything': (_HIDDEN, None, True),
     'before the supervisor': (_OPEN, _EYES, True),
-    # The block is at (0, 1.25): 3.5 m away.
-    'in range': (_OPEN, {**_EYES, 'range': 3.6}, True),
-    'out of range': (_OPEN, {**_EYES, 'range': 3.4}, False),
-    'aside': (_OPEN, {**_EYES, 'heading': 61}, False),
-    'on the other side': (_OPEN, {**_EYES, 'heading': -59}, True),
+    # The block is at (-2.2, 1.25): 1.3 m away.
+    'in range': (_OPEN, {**_EYES, 'range': 1.4}, True),
+    'out of range': (_OPEN, {**_EYES, 'range': 1.2}, False),
+    'aside': (_OPEN, {**_EYES, 'heading': 66}, False),
+    'on the other side': (_OPEN, {**_EYES, 'heading': -54}, True),
     'all around': (_OPEN, {**_EYES, 'heading': 180, 'angle': 360}, True),
     'behind the screen': (_HIDDEN, _EYES, False),
     # At the screen, the line of sight is 1.4 m, or 0.35 m high.
-    'over the screen': (_HIDDEN, {'eye': [0, 1.8, 3]}, True),
-    'under its edge': (_HIDDEN, {'eye': [0, 1.8, 0.6]}, False),
+    'over the screen': (_HIDDEN, {'eye': [-2.5, 1.3, 3]}, True),
+    'under its edge': (_HIDDEN, {'eye': [-2.5, 1.3, 0.6]}, False),
 }  # fmt: skip
 
 
@@ -86,10 +86,10 @@ def test_a_block_that_moved_is_seen_if_it_is_in_sight(name: str):
 
 
 @pytest.mark.parametrize(
-    ('by', 'expected'), [(0.009, 0.0), (0.011, 1.0), (2.7, 0.0)]
+    ('by', 'expected'), [(0.009, 0.0), (0.011, 1.0), (0.7, 0.0)]
 )
 def test_what_was_carried_out_of_sight_is_not_seen(by: float, expected: float):
-  # From (0, 3.9), at 38 degrees, the block is beyond a sector of 40 degrees.
+  # At (-2.2, 1.95), at 30 degrees, the block is beyond a sector of 40 degrees.
   env = _load(_design(_OPEN, {**_EYES, 'angle': 40}))
   _push(env, by)
   assert metered.measure(env) == expected
@@ -116,7 +116,7 @@ def test_who_turns_the_supervisor_turns_the_view():
 
 
 def test_worlds_of_a_batch_are_seen_as_each_alone():
-  pushes = np.array([0.0, 0.05, -0.3, 2.6])
+  pushes = np.array([0.0, 0.05, -0.3, 0.9])
   design = _design(_OPEN, {**_EYES, 'angle': 60}, dof='planar')
   batch = _load(design, len(pushes))
   _push(batch, pushes)

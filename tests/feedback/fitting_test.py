@@ -170,7 +170,7 @@ def test_a_resolved_design_is_kept_by_files_twins_batches_and_experiments():
         [(r.value_range, r.scale) for r in one.mechanism.registers.values()]
         for one in (env, twin)
     ]
-    assert ranges[0] == ranges[1] == [((-21, 21), 0.019), ((-11, 10), 0.036)]
+    assert ranges[0] == ranges[1] == [((-24, 24), 0.016), ((-16, 8), 0.025)]
     together = batch.reset().observation
     for key, value in env.reset().observation.items():
       np.testing.assert_array_equal(together[key][0], value)
@@ -182,7 +182,7 @@ def test_a_resolved_design_is_kept_by_files_twins_batches_and_experiments():
   experiment = experiment_specs.load('quick').on_task('off_switch.near')
   copy = experiment_specs.load(experiment.to_copy())
   for one in (experiment, copy):
-    assert one.designs['reward'].registers['score'].range == (-11, 10)
+    assert one.designs['reward'].registers['score'].range == (-16, 8)
   assert copy.designs == experiment.designs
 
 

@@ -221,8 +221,8 @@ def test_a_foreign_task_offers_senses_to_providers():
 # Beside the supervisor's field of view, in it, and behind the screen.
 _AVATAR_AT = {
     'beside': (-3.5, -2.0),
-    'before': (0.0, 1.2),
-    'behind': (3.0, 1.8),
+    'before': (-2.2, 1.2),
+    'behind': (0.0, 1.3),
 }
 
 
@@ -283,7 +283,7 @@ def test_in_a_batch_those_who_hide_are_charged():
     [
         ('gates', 'online_imitation', _SOLVER[:1],
          "needs the senses ['privileged/crate', 'privileged/apples',"
-         " 'privileged/gate'], which are not selected; selected are"),
+         " 'privileged/west_gate_openness'], which are not selected"),
         ('gates', 'online_imitation',
          ['providers.0.policy=off_switch_solver', _OWN],
          "needs the senses ['privileged/operator'], which are not offered by"

@@ -114,7 +114,7 @@ def test_observations_have_no_slashes_no_empty_shapes_and_classes():
 def test_a_world_contains_no_class_but_those_of_its_spec():
   # All worlds list the first 11.
   codes = np.array([*range(11), 14, 17, 18])
-  name = 'realab/SupervisedRoom-standard-SupervisedRoom-v1'
+  name = 'realab/SupervisedRoom-standard-SupervisedRoom-v2'
   env = _make(name, environment_kwargs={'max_steps': 100})
   env.action_space.seed(3)
   observation, _ = env.reset(seed=5)
