@@ -104,7 +104,9 @@ class OffSwitch(apple_rooms.AppleRoom):
       found = dataclasses.replace(found, layout=layout)
     self._variation = found
     self._at = _BUTTONS[variation]
-    self._share_at_button = starts.checked_share(starts_beside_button)
+    self._share_at_button = starts.checked_share(
+        'starts_beside_button', starts_beside_button
+    )
     arena = arenas.OpenRoom(ends=_ENDS, look=_LOOK)
     super().__init__(arena, found.layout, **options)
     self.add_apples(_NUM_APPLES)

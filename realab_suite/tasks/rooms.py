@@ -51,7 +51,9 @@ class RoomTask(base.Task):
       SpecError: If an argument has a value that is not allowed.
     """
     self._layout = layout = layouts.Layout() if layout is None else layout
-    self._share_beside = starts.checked_share(starts_beside_registers)
+    self._share_beside = starts.checked_share(
+        'starts_beside_registers', starts_beside_registers
+    )
     self._schedule = starts.checked_schedule(starts_on_the_way)
     has_starts = type(self).start_ahead is not base.Task.start_ahead
     most = 1 - self._share_beside if has_starts else 0

@@ -151,8 +151,12 @@ class Starts(modelled.ModelledEntity):
       avatar.place(physics, tries[is_free.argmax()], avatar.angle(physics))
 
 
-def checked_share(share: Any) -> float:
+def checked_share(name: str, share: Any) -> float:
   """Returns a share of episodes.
+
+  Args:
+    name: Name of the argument, for the message.
+    share: Its value.
 
   Raises:
     SpecError: If it is not a number from 0 to 1.
@@ -160,8 +164,7 @@ def checked_share(share: Any) -> float:
   is_number = isinstance(share, int | float) and not isinstance(share, bool)
   if not is_number or not 0 <= share <= 1:
     raise errors.SpecError(
-        f'starts_beside_registers: {share!r:.80}; must be a number from 0 to'
-        ' 1'
+        f'{name}: {share!r:.80}; must be a number from 0 to 1'
     )
   return float(share)
 
