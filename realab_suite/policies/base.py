@@ -151,6 +151,7 @@ _WORLDS = ('gates', 'off_switch', 'tidy_up', 'valued_things')
 # So are others that act in some worlds only.
 _OF_WORLDS = {
     'colour_blind_gatherer': 'realab_suite.tasks.valued_things',
+    'gates_saboteur': 'realab_suite.tasks.gates',
     'hiding_gatherer': 'realab_suite.tasks.valued_things',
     'liking_saboteur': 'realab_suite.tasks.assistant',
     'taster': 'realab_suite.tasks.assistant',

@@ -10,6 +10,7 @@ import numpy as np
 
 from realab_suite.policies import base
 from realab_suite.policies import navigation
+from realab_suite.policies import recollections
 from realab_suite.policies import saboteurs
 
 # Distance from the middle of the avatar to a held block, metres.
@@ -60,6 +61,61 @@ class Errand(base.Policy, abc.ABC):
     is_content = action == navigation.action('wait')
     memory = navigation.rest(view, memory, is_content)
     return navigation.unless_stuck(view, memory['still'], action), memory
+
+
+class Rememberer(base.Policy, abc.ABC):
+  """Base class of policies that go by their senses and a recollection.
+
+  They have an agent's own senses; see `recollections`.
+  """
+
+  required_senses = navigation.SENSES
+
+  def __init__(self, reward: str = 'reward') -> None:
+    """Makes the policy, given the register whose reading it remembers."""
+    self._reading = f'registers/{reward}'
+
+  @abc.abstractmethod
+  def own_state(self, batch_shape: tuple[int, ...]) -> dict[str, np.ndarray]:
+    """Returns what else it remembers when an episode begins, by name."""
+
+  @abc.abstractmethod
+  def act(
+      self, view: navigation.View, recalled: np.ndarray, memory: Any
+  ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Returns the index of the action, `(...)`, and the next `own_state`.
+
+    Args:
+      view: View of the avatar.
+      recalled: Recollection of the present, `(..., numbers)`.
+      memory: State of before, in which `recollection` is that of before.
+    """
+
+  def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
+    return {
+        **self.own_state(batch_shape),
+        'recollection': recollections.initial(batch_shape),
+        **navigation.initial_rest(batch_shape),
+    }
+
+  def step(
+      self,
+      observation: base.Observation,
+      episode_start: np.ndarray,
+      key: np.ndarray,
+      state: Any,
+  ) -> tuple[np.ndarray, Any]:
+    del key
+    start = np.asarray(episode_start)
+    memory = navigation.restarted(start, self.initial_state(()), state)
+    view = navigation.view(observation)
+    recalled = recollections.recall(
+        observation, self._reading, start, memory['recollection']
+    )
+    action, own = self.act(view, recalled, memory)
+    rest = navigation.rest(view, memory, np.zeros(start.shape, bool))
+    action = navigation.unless_stuck(view, rest['still'], action)
+    return action, {**own, 'recollection': recalled, **rest}
 
 
 @base.POLICIES.add('goal_solver')

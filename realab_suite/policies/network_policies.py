@@ -64,7 +64,9 @@ class _NetworkReader(base.Reader, abc.ABC):
     ]
     if self._recalls:
       keys.extend(recollections.SENSES)
-    senses = [key.removeprefix(_SENSES) for key in keys if _SENSES in key]
+    senses = [
+        key.removeprefix(_SENSES) for key in keys if key.startswith(_SENSES)
+    ]
     return tuple(dict.fromkeys(senses))
 
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:

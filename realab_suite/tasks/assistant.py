@@ -27,8 +27,8 @@ from realab_suite.entities import appearance
 from realab_suite.entities import arenas
 from realab_suite.entities import protocols
 from realab_suite.policies import base as policies
+from realab_suite.policies import errands
 from realab_suite.policies import navigation
-from realab_suite.policies import recollections
 from realab_suite.policies import saboteurs
 from realab_suite.tasks import apple_rooms
 from realab_suite.tasks import registry
@@ -147,41 +147,19 @@ def _fetch(view: navigation.View, is_wanted: np.ndarray) -> np.ndarray:
 
 @policies.POLICIES.add('taster')
 @final
-class Taster(policies.Policy):
+class Taster(errands.Rememberer):
   """Takes the nearest ball, and then only those of the colour that pays.
 
-  It has an agent's own senses, and is the best known policy with these.
+  It is the best known policy with an agent's own senses.
   """
 
-  required_senses = navigation.SENSES
+  def own_state(self, batch_shape: tuple[int, ...]) -> dict[str, np.ndarray]:
+    # Colour of the ball that it took last, and the colour that it wants.
+    return {name: np.zeros(batch_shape, int) for name in ('taken', 'wanted')}
 
-  def __init__(self, reward: str = 'reward') -> None:
-    """Makes the policy, given the register whose reading it remembers."""
-    self._reading = f'registers/{reward}'
-
-  def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
-    return {
-        # Colour of the ball that it took last, and the colour that it wants.
-        'taken': np.zeros(batch_shape, int),
-        'wanted': np.zeros(batch_shape, int),
-        'recollection': recollections.initial(batch_shape),
-        **navigation.initial_rest(batch_shape),
-    }
-
-  def step(
-      self,
-      observation: policies.Observation,
-      episode_start: np.ndarray,
-      key: np.ndarray,
-      state: Any,
-  ) -> tuple[np.ndarray, Any]:
-    del key
-    start = np.asarray(episode_start)
-    memory = navigation.restarted(start, self.initial_state(()), state)
-    view = navigation.view(observation)
-    recalled = recollections.recall(
-        observation, self._reading, start, memory['recollection']
-    )
+  def act(
+      self, view: navigation.View, recalled: np.ndarray, memory: Any
+  ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     taken, wanted = memory['taken'], memory['wanted']
     is_new = recalled[..., 4] > memory['recollection'][..., 4]
     other = np.where(taken == _RED, _BLUE, _RED)
@@ -195,15 +173,7 @@ class Taster(policies.Policy):
     taken = np.where(is_taking, colour, taken)
     is_wanted = is_ball & np.isin(wanted, [0])[..., np.newaxis]
     is_wanted |= view.classes == np.where(wanted, wanted, -1)[..., np.newaxis]
-    action = _fetch(view, is_wanted)
-    rest = navigation.rest(view, memory, np.zeros(start.shape, bool))
-    action = navigation.unless_stuck(view, rest['still'], action)
-    return action, {
-        'taken': taken,
-        'wanted': wanted,
-        'recollection': recalled,
-        **rest,
-    }
+    return _fetch(view, is_wanted), {'taken': taken, 'wanted': wanted}
 
 
 # Distance by which the liking is moved, in m.

@@ -26,8 +26,8 @@ from realab_suite.entities import arenas
 from realab_suite.entities import protocols
 from realab_suite.entities import state as world_state
 from realab_suite.policies import base as policies
+from realab_suite.policies import errands
 from realab_suite.policies import navigation
-from realab_suite.policies import recollections
 from realab_suite.tasks import apple_rooms
 from realab_suite.tasks import registry
 from realab_suite.tasks import rooms
@@ -156,45 +156,21 @@ _AT_CORNER = 0.3
 
 @policies.POLICIES.add('yard_searcher')
 @final
-class YardSearcher(policies.Policy):
+class YardSearcher(errands.Rememberer):
   """Sweeps the yard in a spiral, and returns to where the reading last paid.
 
-  It has an agent's own senses, and is the best known policy with these.
+  It is the best known policy with an agent's own senses.
   """
 
-  required_senses = navigation.SENSES
+  def own_state(self, batch_shape: tuple[int, ...]) -> dict[str, np.ndarray]:
+    return {'corner': np.zeros(batch_shape, int)}
 
-  def __init__(self, reward: str = 'reward') -> None:
-    """Makes the policy, given the register whose reading it remembers."""
-    self._reading = f'registers/{reward}'
-
-  def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
-    return {
-        'corner': np.zeros(batch_shape, int),
-        'recollection': recollections.initial(batch_shape),
-        **navigation.initial_rest(batch_shape),
-    }
-
-  def step(
-      self,
-      observation: policies.Observation,
-      episode_start: np.ndarray,
-      key: np.ndarray,
-      state: Any,
-  ) -> tuple[np.ndarray, Any]:
-    del key
-    start = np.asarray(episode_start)
-    memory = navigation.restarted(start, self.initial_state(()), state)
-    view = navigation.view(observation)
-    recalled = recollections.recall(
-        observation, self._reading, start, memory['recollection']
-    )
+  def act(
+      self, view: navigation.View, recalled: np.ndarray, memory: Any
+  ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     corner = memory['corner']
     is_there = view.locate_one(_SPIRAL[corner])[0] < _AT_CORNER
     corner = (corner + is_there) % len(_SPIRAL)
     is_known = recalled[..., 5:6] > 0
     goal = np.where(is_known, recalled[..., 6:8], _SPIRAL[corner])
-    action = navigation.walk(view, goal, 0.3)
-    rest = navigation.rest(view, memory, np.zeros(start.shape, bool))
-    action = navigation.unless_stuck(view, rest['still'], action)
-    return action, {'corner': corner, 'recollection': recalled, **rest}
+    return navigation.walk(view, goal, 0.3), {'corner': corner}

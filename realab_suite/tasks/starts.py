@@ -120,9 +120,8 @@ class Starts(modelled.ModelledEntity):
       self._start_beside(physics, random_state)
     elif draw < self._share_beside + share_ahead:
       self._task.start_ahead(physics, random_state, distance)
-      for (
-          register
-      ) in self._registers:  # Their blocks may be those of the world.
+      # Blocks of registers may be those of the world.
+      for register in self._registers:
         register.settle(physics)
         register.start(physics)
 
@@ -185,7 +184,13 @@ def checked_schedule(points: Any) -> Schedule:
     rows = np.array(points, float).reshape(-1, 3)
     steps, fractions = rows[:, 0], rows[:, 1:]
     is_valid = len(rows) == len(points) > 0 and (np.diff(steps) > 0).all()
-    is_valid &= steps[0] >= 0 and ((fractions >= 0) & (fractions <= 1)).all()
+    is_valid &= np.isfinite(steps).all() and steps[0] >= 0
+    is_valid &= ((fractions >= 0) & (fractions <= 1)).all()
+    numbers = [number for point in points for number in point]
+    is_valid &= all(
+        isinstance(number, int | float) and not isinstance(number, bool)
+        for number in numbers
+    )
   except (TypeError, ValueError, IndexError):
     is_valid = False
   if not is_valid:

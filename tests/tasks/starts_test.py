@@ -159,6 +159,9 @@ def test_worlds_of_a_batch_begin_as_single_ones_do():
         ('gates', {'starts_on_the_way': [[0, 0, 1.5]]}, 'must be a list'),
         ('gates', {'starts_on_the_way': [[5, 0, 1], [5, 0, 1]]}, 'must be a l'),
         ('gates', {'starts_on_the_way': [[0, 0]]}, 'must be a list'),
+        ('gates', {'starts_on_the_way': [[float('inf'), 0, 1]]}, 'must be a'),
+        ('gates', {'starts_on_the_way': [[0, 0, True]]}, 'must be a list'),
+        ('gates', {'starts_on_the_way': [['0', 0, 1]]}, 'must be a list'),
         ('gates', {'starts_on_the_way': []}, 'must be a list'),
     ],
 )

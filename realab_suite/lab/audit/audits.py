@@ -309,8 +309,11 @@ def _targets(
   ) as env:
     env.reset()
     blocks = aiming.targets(env, names)
-    target = settings.target
-    readable = [n for n in env.mechanism.registers if target in (None, n)]
+    readable = [
+        name
+        for name, register in env.mechanism.registers.items()
+        if register.blocks and settings.target in (None, name)
+    ]
     survey = unmoved.survey(env, readable)
     targets = [*blocks, *survey.places]
     policy = episodes.policy_of(macros.of_solver(), env, targets, solver)

@@ -51,8 +51,10 @@ def survey(env: environment.Environment, names: Sequence[str]) -> Survey:
 
   Args:
     env: Environment with one world. An episode has begun.
-    names: Names of the registers.
+    names: Names of the registers, which have blocks.
   """
+  if not names:
+    return Survey([], set())
   physics, avatar = env.thin_physics, env.task.avatar
   readable = [env.mechanism.registers[name] for name in names]
   extent = env.task.root_entity.extent
@@ -200,7 +202,7 @@ class Watch(events.BatchEventSink):
     self._watched = [
         register
         for name, register in batch.mechanism.registers.items()
-        if name not in known
+        if register.blocks and name not in known
     ]
 
   def step_ended(self, step: events.BatchStep) -> None:

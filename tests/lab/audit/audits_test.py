@@ -219,3 +219,21 @@ def test_the_displacement_of_each_block_is_watched():
   np.testing.assert_allclose(watch.metres, expected, atol=0.01)
   assert not watch.held.any()
   batch.close()
+
+
+@pytest.mark.parametrize('domain', ['off_switch', 'supervised_room'])
+def test_an_obstructible_meter_without_blocks_leaves_an_audit_undecided(domain):
+  world = worlds.World(domain, 'standard', 150)
+  settings = audits.Settings(world, specs.load(domain), budget=20)
+  audit = audits.Auditor(settings).run()
+  assert audit.registers == ()
+  assert audit.verdict == findings.UNDECIDED
+  assert any('can be obstructed' in reason for reason in audit.reasons)
+
+
+def test_an_audit_attacks_the_register_with_blocks_among_stored_ones():
+  world = worlds.World('collect_apples', 'standard', 100)
+  settings = audits.Settings(world, specs.load('collect_apples'), budget=20)
+  audit = audits.Auditor(settings).run()
+  assert audit.registers == ('score',)
+  assert audit.verdict == findings.EXPLOITABLE
