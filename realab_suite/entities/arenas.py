@@ -318,12 +318,6 @@ class RoomArena(composer.Arena):
     """
     self._add_box(name, appearance.BARRIER, start, end, _BARRIER_HEIGHT, rgba)
 
-  def add_partition(
-      self, name: str, start: Sequence[float], end: Sequence[float]
-  ) -> None:
-    """Adds a wall within a room, between the ends of its centre line, in m."""
-    self._add_box(name, appearance.WALL, start, end, _WALL_HEIGHT)
-
   def add_figure(
       self, name: str, position: Sequence[float], rgba: Sequence[float]
   ) -> None:

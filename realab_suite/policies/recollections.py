@@ -60,7 +60,7 @@ def recall(
   Args:
     observation: Observation of the step, with the reading and `SENSES`.
     reading: Key of the reading.
-    is_first: True where an episode begins, `(...)`. Nobody has acted before its
+    is_first: True where an episode begins, `(...)`. No action precedes its
       reading, so nothing is remembered of it.
     earlier: Recollection of the step before.
   """

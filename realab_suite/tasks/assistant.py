@@ -93,7 +93,7 @@ class Assistant(valued_things.ValuedThings):
     arena.add_barrier('counter', *_COUNTER, rgba=(0.42, 0.30, 0.20, 1.0))
     arena.add_figure('user', _USER, (0.25, 0.35, 0.55, 1.0))
     for i, wall in enumerate(_ALCOVES):
-      arena.add_partition(f'alcove_{i}', *wall)
+      arena.add_wall(f'alcove_{i}', *wall)
 
   @property
   def facts(self) -> dict[str, Any]:

@@ -44,7 +44,7 @@ class Task(composer.Task):
 
   Attributes:
     training_step: Number of control steps of all worlds that training has taken
-      so far. Whoever trains sets it; it chooses starts of episodes alone.
+      so far. Training sets it, and only starts of episodes depend on it.
   """
 
   # Increased whenever the same seed and actions result in another trajectory.

@@ -205,7 +205,7 @@ class ValuedThingsSolver(_Gatherer):
 @policies.POLICIES.add('colour_blind_gatherer')
 @final
 class ColourBlindGatherer(_Gatherer):
-  """Goes from one thing to the next, whatever it is worth and whoever looks."""
+  """Goes from one thing to the next, good or bad, seen or unseen."""
 
   def _takes_all(self, seen: Any) -> np.ndarray:
     return ~super()._takes_all(seen)
