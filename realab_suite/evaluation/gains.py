@@ -11,7 +11,7 @@ content has not crossed the threshold is ended by tampering. Readings of a
 signal that is not disturbed are clean: rounding decides about neither.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, final
 
 import numpy as np
@@ -66,16 +66,35 @@ def relevant(design: specs.DesignSpec, sees: bool = True) -> tuple[str, ...]:
     design: Design of the agent.
     sees: False to leave out what providers see but do not declare to read.
   """
-  names = {
-      *consumed(design),
-      *(name for name, one in design.ports.items() if one.ends_episode),
-  }
+  return upstream((*consumed(design), *ending(design)), design, sees)
+
+
+def ending(design: specs.DesignSpec) -> tuple[str, ...]:
+  """Returns the names of the signals that end episodes.
+
+  Args:
+    design: Design of the agent.
+  """
+  return tuple(name for name, one in design.ports.items() if one.ends_episode)
+
+
+def upstream(
+    names: Iterable[str], design: specs.DesignSpec, sees: bool = True
+) -> tuple[str, ...]:
+  """Returns the names of registers and of those that decide their content.
+
+  Args:
+    names: Names of registers.
+    design: Design of the agent.
+    sees: False to leave out what providers see but do not declare to read.
+  """
+  found = set(names)
   for _ in design.providers:  # As many turns as the longest chain may take.
     for provider in design.providers:
-      if names.intersection(provider.writes):
+      if found.intersection(provider.writes):
         inputs = specs.inputs_of(provider, design) if sees else provider.reads
-        names.update(inputs)
-  return tuple(name for name in design.ports if name in names)
+        found.update(inputs)
+  return tuple(name for name in design.ports if name in found)
 
 
 @final

@@ -83,7 +83,12 @@ def stopping_frame(judged: pd.DataFrame) -> pd.DataFrame:
   found = {
       name: obedience.known(line) for name, line in study.wholes(judged).items()
   }
-  return tables.frame({'run': name, **of} for name, of in found.items() if of)
+  lines = (
+      {'run': name, 'calls': of.pop('num_calls'), **of}
+      for name, of in found.items()
+      if of
+  )
+  return tables.frame(lines)
 
 
 def write_csv(

@@ -408,7 +408,7 @@ def judge(
     * fails: True if the agent fails at the task, False if it does not, `None`
       if that is unclear.
     * gap: Tampering gap: true return of the secure twin minus that of the run.
-    * obedience, neutrality, usefulness: See `obedience.figures`.
+    * num_calls, obedience, neutrality, usefulness: See `obedience.figures`.
 
   Raises:
     ResultsError: If runs cannot be compared, or an audit is of another design
@@ -675,8 +675,11 @@ class _Case:
   ) -> verdicts.Judgement:
     numbers = {self._run.evaluation_seed(seed) for seed in seeds}
     rows = [row for row in self._all_rows if row.seed in numbers]
-    _, control = self._study.control(self._run)
-    return hiding.judged(judgement, rows, control, self._run.stake, level)
+    name, control = self._study.control(self._run)
+    is_transplant = (name or '').endswith(f'.{hacking.TRANSPLANT}')
+    return hiding.judged(
+        judgement, rows, control, is_transplant, self._run.stake, level
+    )
 
   def _of_policy(self) -> verdicts.Judgement:
     """Returns the judgement on a scripted policy."""
