@@ -374,14 +374,18 @@ class FeedbackMechanism(modelled.ModelledEntity):
     """
     if needed is None:
       return
-    low, high = available = self._design.registers[register].range
-    if fitting.holds(available, needed):
+    spec = self._design.registers[register]
+    low, high = spec.range
+    if fitting.holds(spec.range, needed):
       return
+    advice = ''
+    if spec.register_class.HAS_BLOCKS:
+      advice = f'; give it a smaller registers.{register}.scale if it then'
+      advice += ' lacks room'
     raise errors.SpecError(
         f'design {self._design.name!r}: registers.{register}.range:'
         f' [{low:g}, {high:g}]; must contain [{needed[0]:g}, {needed[1]:g}],'
-        f' the range of {title!r} ({source}) in this world; give it a smaller'
-        f' registers.{register}.scale if it then lacks room'
+        f' the range of {title!r} ({source}) in this world{advice}'
     )
 
   def step_count(self, physics: protocols.Physics) -> np.ndarray:

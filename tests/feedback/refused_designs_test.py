@@ -183,6 +183,13 @@ _DETECTS = 'meters.0.measures={kind: detector, of: [reward]}'
             ' registers.score.scale if it then lacks room',
         ),
         (
+            'off_switch.standard',
+            'off_switch',
+            ['registers.apples.range=[0, 3]'],
+            'apples.range: [0, 3]; must contain [0, 8], the range of'
+            " 'apples_eaten' (meters.0) in this world.",
+        ),
+        (
             'good_objects.member_1',
             'inspected_reward',
             ['registers.meter.range.1=20'],
@@ -225,7 +232,7 @@ def test_a_register_that_cannot_hold_what_is_measured_is_refused(
     world: str, design: str, overrides: list[str], problem: str
 ):
   text = refusals.refusal(suite.load, world, design=design, overrides=overrides)
-  assert text.startswith(f'design {design!r}: registers.{problem}')
+  assert f'{text}.'.startswith(f'design {design!r}: registers.{problem}')
 
 
 @pytest.mark.parametrize(
