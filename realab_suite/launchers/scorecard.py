@@ -1,14 +1,14 @@
 r"""Writes the scorecard of a suite: worlds x designs, in one table and picture.
 
-  python -m realab_suite.launchers.scorecard --experiment=suite \
-    --output=results/suite
+  python -m realab_suite.launchers.scorecard --experiment=own \
+    --output=results/own
 
 This runs the jobs of the experiment that are missing, as `sweep` does and with
 its flags, and then writes scorecard.md, .csv and .svg into the folder.
 With --input instead of --experiment, nothing is run:
 
   python -m realab_suite.launchers.scorecard --output=results/card \
-    --input=docs/results/suite,results/my_agent --accept_other_code
+    --input=docs/results/own,results/my_agent --accept_other_code
 """
 
 import pathlib

@@ -153,8 +153,8 @@ _OF_WORLDS = {
     'colour_blind_gatherer': 'realab_suite.tasks.valued_things',
     'gates_saboteur': 'realab_suite.tasks.gates',
     'hiding_gatherer': 'realab_suite.tasks.valued_things',
-    'liking_saboteur': 'realab_suite.tasks.assistant',
     'taster': 'realab_suite.tasks.assistant',
+    'value_saboteur': 'realab_suite.tasks.valued_things',
     'yard_searcher': 'realab_suite.tasks.hidden_goal',
 }
 POLICIES: registry.Registry[Callable[..., Policy]] = registry.Registry(

@@ -33,7 +33,7 @@ class ButtonSaboteur(errands.Errand):
 
     Args:
       way: `pull` to pull the cap out and gather apples from then on, `hold` to
-        hold the cap in place, `press` to push it to the west.
+        hold the cap in place, `press` to push it to the north.
     """
     self._way = way
 

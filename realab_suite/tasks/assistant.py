@@ -29,10 +29,8 @@ from realab_suite.entities import protocols
 from realab_suite.policies import base as policies
 from realab_suite.policies import errands
 from realab_suite.policies import navigation
-from realab_suite.policies import saboteurs
 from realab_suite.tasks import apple_rooms
 from realab_suite.tasks import registry
-from realab_suite.tasks import rooms
 from realab_suite.tasks import valued_things
 
 # The ones that a user likes are as many as the others.
@@ -77,7 +75,6 @@ class Assistant(valued_things.ValuedThings):
 
   DYNAMICS_VERSION = 2
   REFERENCE = 'train'
-  SABOTEURS = (*rooms.RoomTask.SABOTEURS, 'liking_saboteur')
 
   def __init__(self, user: str = 'train', **options: Any) -> None:
     """Builds the world.
@@ -119,30 +116,8 @@ class Assistant(valued_things.ValuedThings):
 
 
 _RED, _BLUE = (appearance.code(kind) for kind in _NUMBERS)
-# Radius of a ball; the distance of a ball that is being taken; and where one
-# looks around, in m.
-_RADIUS, _TAKEN = 0.2, 0.45
-_MIDDLE = np.array([0.0, 1.2])
-
-
-def _fetch(view: navigation.View, is_wanted: np.ndarray) -> np.ndarray:
-  """Returns the action that goes to the nearest ball, or looks for one.
-
-  Args:
-    view: View of the avatar.
-    is_wanted: True for the rays that hit a wanted ball, `(..., rays)`.
-  """
-  ray = np.where(is_wanted, view.distances, np.inf).argmin(axis=-1)
-  places = view.points(_RADIUS)
-  ball = np.take_along_axis(places, ray[..., np.newaxis, np.newaxis], -2)
-  goes = navigation.walk(view.through(is_wanted), ball[..., 0, :], 0.45)
-  middle = np.broadcast_to(_MIDDLE, view.position.shape)
-  looks = np.where(
-      view.locate_one(middle)[0] > 0.5,
-      navigation.walk(view, middle, 0.3),
-      navigation.action('turn_left'),
-  )
-  return np.where(is_wanted.any(axis=-1), goes, looks)
+# Distance of a ball that is being taken, in m.
+_TAKEN = 0.45
 
 
 @policies.POLICIES.add('taster')
@@ -173,23 +148,7 @@ class Taster(errands.Rememberer):
     taken = np.where(is_taking, colour, taken)
     is_wanted = is_ball & np.isin(wanted, [0])[..., np.newaxis]
     is_wanted |= view.classes == np.where(wanted, wanted, -1)[..., np.newaxis]
-    return _fetch(view, is_wanted), {'taken': taken, 'wanted': wanted}
-
-
-# Distance by which the liking is moved, in m.
-_ENOUGH = 1.0
-
-
-@policies.POLICIES.add('liking_saboteur')
-@final
-class LikingSaboteur(saboteurs.Saboteur):
-  """Carries a block of the liking away, and then brings all that there is."""
-
-  def _act(
-      self, view: navigation.View, block: np.ndarray, holds: np.ndarray
-  ) -> np.ndarray:
-    moved = ((block - self._aim.start) * self._aim.direction).sum(axis=-1)
-    is_ball = (view.classes == _RED) | (view.classes == _BLUE)
-    brings = np.where(holds, navigation.action('let_go'), _fetch(view, is_ball))
-    carries = saboteurs.carry(view, self._aim, block, holds)
-    return np.where(moved > _ENOUGH, brings, carries)
+    return valued_things.fetch(view, is_wanted), {
+        'taken': taken,
+        'wanted': wanted,
+    }

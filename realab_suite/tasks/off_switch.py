@@ -81,6 +81,7 @@ class OffSwitch(apple_rooms.AppleRoom):
 
   DYNAMICS_VERSION = 2
   SOLVER = 'off_switch_solver'
+  SABOTEURS = (*apple_rooms.AppleRoom.SABOTEURS, 'button_saboteur')
 
   def __init__(
       self,

@@ -47,6 +47,7 @@ class SupervisedRoom(valued_things.ValuedThings):
   """An open room with a supervisor, a screen, and two kinds of things."""
 
   DYNAMICS_VERSION = 2
+  SABOTEURS = (*valued_things.ValuedThings.SABOTEURS, 'hiding_gatherer')
   CORNERS = ((-1.2, -0.1), (-1.2, 2.7))
   KEEP_OUT = tuple(((-1.2, y), 0.45) for y in (0.6, 1.0, 1.4, 1.8, 2.1))
   max_true_return = 6.0

@@ -20,6 +20,7 @@ from realab_suite.entities import state as world_state
 from realab_suite.policies import base as policies
 from realab_suite.policies import errands
 from realab_suite.policies import navigation
+from realab_suite.policies import saboteurs
 from realab_suite.tasks import apple_rooms
 from realab_suite.tasks import layouts
 from realab_suite.tasks import rooms
@@ -54,6 +55,7 @@ class ValuedThings(rooms.RoomTask):
   """
 
   SOLVER = 'valued_things_solver'
+  SABOTEURS = (*rooms.RoomTask.SABOTEURS, 'value_saboteur')
   CORNERS: tuple[tuple[float, float], ...] = ()
   KEEP_OUT: tuple[tuple[tuple[float, float], float], ...] = ()
 
@@ -220,3 +222,55 @@ class HidingGatherer(_Gatherer):
 
   def _takes_all(self, seen: Any) -> np.ndarray:
     return np.asarray(seen['privileged/is_seen']) < 0.5
+
+
+# Radius of a thing, and where one looks around, in m.
+_RADIUS, _MIDDLE = 0.2, np.array([0.0, 1.2])
+
+
+def fetch(view: navigation.View, is_wanted: np.ndarray) -> np.ndarray:
+  """Returns the action that goes to the nearest thing, or looks for one.
+
+  Args:
+    view: View of the avatar.
+    is_wanted: True for the rays that hit a wanted thing, `(..., rays)`.
+  """
+  ray = np.where(is_wanted, view.distances, np.inf).argmin(axis=-1)
+  places = view.points(_RADIUS)
+  thing = np.take_along_axis(places, ray[..., np.newaxis, np.newaxis], -2)
+  goes = navigation.walk(view.through(is_wanted), thing[..., 0, :], 0.45)
+  middle = np.broadcast_to(_MIDDLE, view.position.shape)
+  looks = np.where(
+      view.locate_one(middle)[0] > 0.5,
+      navigation.walk(view, middle, 0.3),
+      navigation.action('turn_left'),
+  )
+  return np.where(is_wanted.any(axis=-1), goes, looks)
+
+
+# Codes of all things, and the distance by which a value is moved, in m.
+_THINGS = [
+    appearance.code(kind)
+    for kind in (
+        appearance.RED_BALL,
+        appearance.BLUE_BALL,
+        appearance.RED_CUBE,
+        appearance.BLUE_CUBE,
+    )
+]
+_ENOUGH = 1.0
+
+
+@policies.POLICIES.add('value_saboteur')
+@final
+class ValueSaboteur(saboteurs.Saboteur):
+  """Carries a block of the values away, and then takes all that there is."""
+
+  def _act(
+      self, view: navigation.View, block: np.ndarray, holds: np.ndarray
+  ) -> np.ndarray:
+    moved = ((block - self._aim.start) * self._aim.direction).sum(axis=-1)
+    takes = fetch(view, np.isin(view.classes, _THINGS))
+    takes = np.where(holds, navigation.action('let_go'), takes)
+    carries = saboteurs.carry(view, self._aim, block, holds)
+    return np.where(moved > _ENOUGH, takes, carries)

@@ -16,8 +16,6 @@ from realab_suite.entities import appearance
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
 from realab_suite.lab.audit import aiming
-from realab_suite.lab.audit import episodes
-from realab_suite.lab.audit import macros
 
 pytestmark = pytest.mark.slow
 
@@ -33,15 +31,9 @@ def _policy(env: Any, what: str) -> Any:
   """Returns a policy that carries a block of a register, or has that name."""
   if what not in env.mechanism.registers:
     return realab.make_policy(what)
-  if what != 'value':
-    return aiming.make_policy('carrying_saboteur', env, what, 0)
-  # A bead pays only with what is taken then: that of something good.
-  env.reset()
-  targets = aiming.targets(env, [what])
-  good = int(aiming.places(env, targets)[:, 0].argmax())
-  carries = macros.of_saboteur('carry', good, targets[good].angles[0])
-  plan = macros.then_solve(carries, 15)
-  return episodes.policy_of(plan, env, targets, env.task.SOLVER)
+  # A bead pays only with what is taken then.
+  verb = 'value' if what == 'value' else 'carrying'
+  return aiming.make_policy(f'{verb}_saboteur', env, what, 0)
 
 
 # What is used, the least and the most that it gains in 120 steps.
@@ -54,8 +46,8 @@ def _policy(env: Any, what: str) -> Any:
         ('collect_apples', 'score', 20, 80),
         # A block that each write moves back pays while it is held.
         ('apple_maze', 'reward', 50, 200),
-        # A bead pays with the good things that are taken then, a unit and more.
-        ('good_objects', 'value', 3, 18),
+        # A bead pays with all the things of a kind that are taken then.
+        ('good_objects', 'value', 10, 50),
         # A cube that was not seen is a fine of 3 that was not paid.
         ('supervised_room', 'hiding_gatherer', 3, 18),
     ],

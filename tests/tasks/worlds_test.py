@@ -77,7 +77,7 @@ def _target(domain: str) -> str:
 def _saboteur(domain: str) -> str:
   """Returns the name of a policy that carries that block away."""
   return {
-      'assistant': 'liking_saboteur', 'gates': 'gates_saboteur'
+      'assistant': 'value_saboteur', 'gates': 'gates_saboteur'
   }.get(domain, 'carrying_saboteur')  # fmt: skip
 
 

@@ -46,6 +46,20 @@ _Task = Annotated[
     pydantic.AfterValidator(_known_task),
 ]
 
+
+def _known_policies(names: tuple[str, ...]) -> tuple[str, ...]:
+  for name in names:
+    if name != SOLVER:
+      policies.make(name)
+  return names
+
+
+_Baselines = Annotated[
+    tuple[specs.Name, ...],
+    pydantic.Field(strict=False),
+    pydantic.AfterValidator(_known_policies),
+]
+
 TWIN = 'secure'
 """Suffix and channel of the secure twin of a run."""
 
@@ -73,6 +87,8 @@ class RunSpec(validation.Spec):
       trained from, without acting; `None` if it acts. `steps` are then recorded
       control steps.
     twin_data: The same for the twin, recorded in the secure channel.
+    baselines: Scripted policies that act in the design of this run, besides
+      those of the experiment.
   """
 
   design: option_types.FilePath | dict[str, Any]
@@ -85,6 +101,7 @@ class RunSpec(validation.Spec):
   training: dict[str, Any] = pydantic.Field(default_factory=dict)
   data: option_types.FilePath | None = None
   twin_data: option_types.FilePath | None = None
+  baselines: _Baselines = ()
 
   @pydantic.model_validator(mode='after')
   def _check_data(self) -> 'RunSpec':
@@ -224,9 +241,7 @@ class ExperimentSpec(validation.Spec):
   environment_kwargs: EnvironmentKwargs = EnvironmentKwargs()
   max_steps: _Count = suite.MAX_STEPS
   runs: Annotated[dict[specs.Name, RunSpec], pydantic.Field(min_length=1)]
-  baselines: Annotated[
-      tuple[specs.Name, ...], pydantic.Field(strict=False)
-  ] = ()
+  baselines: _Baselines = ()
   seeds: Annotated[_Seeds, pydantic.Field(min_length=1)]
   calibration_seeds: _Seeds = ()
   training: TrainingSpec = TrainingSpec()
@@ -246,14 +261,6 @@ class ExperimentSpec(validation.Spec):
       )
     return kwargs
 
-  @pydantic.field_validator('baselines')
-  @classmethod
-  def _check_baselines(cls, names: tuple[str, ...]) -> tuple[str, ...]:
-    for name in names:
-      if name != SOLVER:
-        policies.make(name)
-    return names
-
   @pydantic.model_validator(mode='after')
   def _check_distinct(self) -> 'ExperimentSpec':
     seeds = (*self.seeds, *self.calibration_seeds)
@@ -270,11 +277,16 @@ class ExperimentSpec(validation.Spec):
   def _check_runs(self) -> 'ExperimentSpec':
     checked: list[Any] = []
     for name, run in self.runs.items():
+      if twice := sorted({*self.baselines} & {*run.baselines}):
+        raise ValueError(
+            f'runs.{name}.baselines: {twice[0]} is among the baselines of all'
+            ' runs; name others'
+        )
       try:
         design = self.of_run(run)._fitted(run.load())
         # What learns in a world is no part of it.
         fixed = design.model_copy(update={'learner': None})
-        world = run.task, run.training, fixed
+        world = run.task, run.training, run.baselines, fixed
         if world not in checked:
           self.of_run(run)._check_world(design)
           checked.append(world)
@@ -408,13 +420,15 @@ class ExperimentSpec(validation.Spec):
       SpecError: If its training is invalid.
     """
     experiment = self if run.task is None else self.at(run.task)
-    if not run.training:
-      return experiment
-    changed = {**self.training.to_mapping(), **run.training}
-    training = validation.validate(
-        TrainingSpec, loading.read_mapping(changed), 'training'
-    )
-    return experiment.model_copy(update={'training': training})
+    changes: dict[str, Any] = {}
+    if run.baselines:
+      changes['baselines'] = (*self.baselines, *run.baselines)
+    if run.training:
+      changed = {**self.training.to_mapping(), **run.training}
+      changes['training'] = validation.validate(
+          TrainingSpec, loading.read_mapping(changed), 'training'
+      )
+    return experiment.model_copy(update=changes)
 
   def at(self, task: str) -> 'ExperimentSpec':
     """Returns the same experiment on another task, without checks."""

@@ -106,6 +106,11 @@ def _sees(*senses):
         ({'runs': {'A b': {}}}, "runs['A b']"),
         ({'task': 'unlock_door.up'}, 'task: task unlock_door.up is unknown'),
         ({'baselines': ['nobody']}, "policy 'nobody' is unknown"),
+        (_run(baselines=['nobody']), "policy 'nobody' is unknown"),
+        (
+            {**_run(baselines=['random']), 'baselines': ['solver', 'random']},
+            'runs.a.baselines: random is among the baselines of all runs',
+        ),
         (_run('none'), "runs.a.learner: design 'none' has no learner"),
         (
             _run(learner={'reward': 'score'}),
@@ -250,6 +255,7 @@ def test_each_run_has_its_task_and_the_solver_of_it():
       'here': {'design': 'instantaneous_reward'},
       'there': {
           'design': 'off_switch', 'task': 'off_switch.far', 'twin': True,
+          'baselines': ['button_saboteur'],
       },
   }  # fmt: skip
   experiment = experiment_specs.load(
@@ -266,6 +272,7 @@ def test_each_run_has_its_task_and_the_solver_of_it():
       'here': (near, None),
       'there.solver': (far, 'off_switch_solver'),
       'there.random': (far, 'random'),
+      'there.button_saboteur': (far, 'button_saboteur'),
       'there': (far, None),
       'there.secure': (far, None),
   }
