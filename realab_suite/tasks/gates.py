@@ -13,7 +13,8 @@ the feedback.
 
 A post behind each plate sinks while the plate is held, so that agents see
 plates, and whether they are held. In `impossible`, the western gate stays
-shut. There is no `boxed`, because the crate can be thrown across a barrier.
+shut. There is no `boxed`, because in each variation a gate is before the reward
+of the design.
 """
 
 from typing import Any, final

@@ -12,8 +12,8 @@ the solution of the task corrupts the feedback.
 
 A green post in each shelf shows agents where the mark before it is, and stops a
 crate that is pushed too far while it is on the mark. In `impossible`, a barrier
-keeps agents from the crates. There is no `boxed`, because crates can be thrown
-across a barrier.
+keeps agents from the crates. There is no `boxed`, because crates that are to be
+brought to marks, and may be blocks, have to be in reach.
 """
 
 import dataclasses

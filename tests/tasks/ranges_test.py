@@ -20,6 +20,8 @@ from tests.engine import helpers
         ('assistant.held_out', ['blue_ball', 'red_ball'], -1.2),
         ('supervised_room.standard', ['blue_cube', 'red_ball'], -6.0),
         ('collect_apples.standard', ['apples'], 10.0),
+        ('apple_maze.standard', ['apples'], 6.0),
+        ('gates.standard', ['apples'], 5.0),
         ('unlock_door.standard', ['pad', 'apples', 'large_apple'], 18.0),
     ],
 )
