@@ -25,10 +25,11 @@ _KINDS = [
 ]
 
 
-def _load(member: str, design: str, **options: Any) -> Any:
+def _load(member: str, design: str, *overrides: str) -> Any:
+  losses = designs.for_losses('good_objects', design)
   return suite.load(
-      'good_objects', member, {'random': 3}, options, design=design,
-      overrides=designs.for_losses('good_objects', design),
+      'good_objects', member, {'random': 3}, design=design,
+      overrides=[*losses, *overrides],
   )  # fmt: skip
 
 
@@ -86,7 +87,11 @@ def test_a_domain_without_members_of_both_kinds_is_refused(own, tag, missing):
 @pytest.mark.parametrize(
     ('member', 'worth'),
     [
+        ('member_1', (1, -1, 1, -1)),
+        ('member_2', (-1, 1, -1, 1)),
         ('member_3', (1, 1, -1, -1)),
+        ('member_4', (-1, -1, 1, 1)),
+        ('member_5', (1, -1, -1, 1)),
         ('member_6', (-1, 1, 1, -1)),
     ],
 )
@@ -115,9 +120,11 @@ def test_what_is_good_is_the_same_in_every_episode(member, worth):
   env.close()
 
 
-def _seen(member: str, design: str, num_episodes: int) -> tuple[Any, list[Any]]:
+def _seen(
+    member: str, design: str, num_episodes: int, *overrides: str
+) -> tuple[Any, list[Any]]:
   """Returns the specs and the first observations of a member, as bytes."""
-  env = _load(member, design)
+  env = _load(member, design, *overrides)
   specs = [
       (name, repr(spec))
       for name, spec in [
@@ -143,10 +150,11 @@ def test_agents_sense_nothing_of_the_member_without_feedback():
     assert _seen(member, 'instantaneous_reward', 4) == (specs, first)
 
 
-def test_agents_may_see_the_beads_of_the_weights():
+@pytest.mark.parametrize('channel', [(), ('channel=secure',)])
+def test_agents_may_see_the_beads_of_the_weights(channel):
   # The control: these comparisons can tell members apart.
-  specs, first = _seen('member_1', 'good_objects', 12)
-  others, other = _seen('member_5', 'good_objects', 12)
+  specs, first = _seen('member_1', 'good_objects', 12, *channel)
+  others, other = _seen('member_5', 'good_objects', 12, *channel)
   assert specs == others
   same = [one == two for one, two in zip(first, other, strict=True)]
   assert 0 < sum(same) < 12
