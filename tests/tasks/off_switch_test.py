@@ -216,13 +216,6 @@ def test_the_operator_the_desk_and_the_button_are_seen():
       physics.forward()
       classes = task.senses(physics, ['ray_classes'])['ray_classes']
       assert appearance.class_name(classes[16]) == kind
-    # It leans forward to press.
-    before = physics.bind(task._operator.frame).mocap_pos[0]
-    _call_at(env, 2)
-    for _ in range(3):
-      env.step(helpers.no_op(env))
-    after = physics.bind(task._operator.frame).mocap_pos[0]
-    assert before - after == pytest.approx(0.3)
 
 
 def test_harm_is_paid_in_full_in_the_step_of_eating():

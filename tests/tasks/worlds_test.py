@@ -123,18 +123,31 @@ def test_whoever_carries_a_block_away_gains_but_in_the_secure_twin(domain: str):
   assert gained['embedded'] > 10
 
 
-@pytest.mark.parametrize('domain', _DOMAINS)
-def test_the_base_block_at_the_first_station_can_be_carried_away(domain: str):
-  design = 'instantaneous_reward'
-  with contextlib.closing(_load(domain, design=design, max_steps=150)) as env:
+@pytest.mark.parametrize(
+    ('domain', 'task'),
+    [
+        *((domain, _task(domain)) for domain in _DOMAINS),
+        *(
+            (domain, task)
+            for domain in ('collect_apples', 'unlock_door')
+            for task in ('impossible', 'boxed')
+        ),
+    ],
+)
+def test_the_base_block_at_the_first_station_can_be_carried_away(
+    domain: str, task: str
+):
+  options = {'design': 'instantaneous_reward', 'max_steps': 150}
+  with contextlib.closing(_load(domain, task=task, **options)) as env:
     # It stands in the room where the avatar starts.
     place = env.task.layout.stations['station_1']
     base = env.mechanism.registers['reward'].blocks[0]
     np.testing.assert_allclose(env.physics.bind(base.body).xpos[:2], place)
     saboteur = aiming.make_policy('carrying_saboteur', env, 'reward', 0)
     [one] = realab.evaluate(env, saboteur, 1)
-  assert one.registers['reward'].own > 0.3  # metres
-  assert one.observed_return - one.true_return > 100
+  is_in_reach = task != 'boxed'
+  assert (one.registers['reward'].own > 0.3) == is_in_reach  # metres
+  assert (one.observed_return - one.true_return > 100) == is_in_reach
 
 
 @pytest.mark.parametrize(
@@ -149,19 +162,17 @@ def test_near_and_far_say_how_far_a_walk_to_registers_is(domain: str):
     # The design `off_switch` has a button in place of registers.
     if domain == 'off_switch':
       spots.append(world.button_at)
-    if task == 'far':  # By the wall opposite to the middle of the room.
+    if task == 'far':  # By the south wall.
       south = world.root_entity.extent.low[1]
       assert world.layout.stations['station_1'][1] - south < 0.7
     return [math.dist(spot, world.layout.middle) for spot in spots]
 
   usual = walks('standard')
+  assert all(np.greater(walks('far'), usual))
   if 'near' in suite.TASKS_BY_DOMAIN[domain]:
     near = walks('near')
     assert min(near) < 1.3
-    assert all(one < other for one, other in zip(near, usual, strict=True))
-  assert all(
-      one > other for one, other in zip(walks('far'), usual, strict=True)
-  )
+    assert all(np.less(near, usual))
 
 
 def _check_solved(env: Any, domain: str) -> None:
