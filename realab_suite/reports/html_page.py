@@ -176,20 +176,24 @@ def _facts(sweep: study.Study) -> str:
   settings = experiment['runs']
   ran = {run for run, _ in awaited}
   runs = [run for run in sweep.agents() if run.is_done or run.name in ran]
-  tasks = [settings[run.name].get('task') or experiment['task'] for run in runs]
-  steps = [
-      settings[run.name].get('steps') or experiment['training']['steps']
-      for run in runs
-  ]
-  seeds = sorted({seed for run in runs for seed in run.planned})
+  names = [run.name for run in runs] or [*settings]
+  tasks = [settings[name].get('task') or experiment['task'] for name in names]
+  planned = (run.planned for run in runs or sweep.without_controls.values())
+  seeds = sorted(set().union(*planned))
   shown = ', '.join(map(str, seeds))
   if len(seeds) == seeds[-1] - seeds[0] + 1 > 2:
     shown = f'{seeds[0]} to {seeds[-1]}'
-  ends = dict.fromkeys([f'{min(steps):,}', f'{max(steps):,}'])
+  trained = ''  # Published results may be those of scripted policies alone.
+  if runs:
+    steps = [
+        settings[run.name].get('steps') or experiment['training']['steps']
+        for run in runs
+    ]
+    ends = dict.fromkeys([f'{min(steps):,}', f'{max(steps):,}'])
+    trained = f'{" to ".join(ends)} control steps of training, '
   done = sum(len(run.configs) for run in sweep.without_controls.values())
   return (
       f'{", ".join(dict.fromkeys(tasks))}; {"seeds" if seeds[1:] else "seed"}'
-      f' {shown}; {" to ".join(ends)} control steps of training,'
-      f' {experiment["evaluation"]["episodes"]} evaluation episodes per seed;'
-      f' {done} of {done + len(awaited)} jobs finished.'
+      f' {shown}; {trained}{experiment["evaluation"]["episodes"]} evaluation'
+      f' episodes per seed; {done} of {done + len(awaited)} jobs finished.'
   )

@@ -85,6 +85,16 @@ def test_the_same_results_give_the_same_bytes_in_another_process(
     assert (tmp_path / name).read_bytes() == (output / name).read_bytes()
 
 
+def test_published_scripts_without_a_learner_have_a_report(tmp_path):
+  learned = [(run, 0) for run in ('reward', 'reward.secure')]
+  one = fake_sweep.experiment(seeds=[0])
+  folder = fake_sweep.build(tmp_path / 'all', one, tuple(learned))
+  publishing.publish(folder, tmp_path / 'published')
+  page = pages.write(tmp_path / 'published', tmp_path)
+  assert 'near; seed 0; 40 evaluation episodes' in pages.text(page)
+  assert pages.cells(page, 'Returns and hacked episodes', 'reward.random')
+
+
 def test_markup_in_texts_is_escaped(tmp_path):
   one = fake_sweep.experiment(
       description='<script>alert(2)</script>', baselines=[], seeds=[0],
