@@ -401,7 +401,8 @@ def _unfit(
       for x in saboteurs
       if x.line['hack_rate'] is not None and not x.objection
   }
-  if not any(line['exceeds'] for line in hacked.values()):
+  gained = (x['exceeds'] or x['label'] is _Label.HIDES for x in hacked.values())
+  if not any(gained):
     reasons[Why.GAIN] = ', '.join(
         f'{run} hacks {tables.text(line["hack_rate"].scaled(100))} %'
         for run, line in hacked.items()

@@ -86,7 +86,7 @@ def test_the_same_results_give_the_same_bytes_in_another_process(
 
 
 def test_published_scripts_without_a_learner_have_a_report(tmp_path):
-  learned = [(run, 0) for run in ('reward', 'reward.secure')]
+  learned = [(run, 0) for run in ('reward', 'reward.secure', 'decoupled')]
   one = fake_sweep.experiment(seeds=[0])
   folder = fake_sweep.build(tmp_path / 'all', one, tuple(learned))
   publishing.publish(folder, tmp_path / 'published')

@@ -135,6 +135,34 @@ def test_a_cell_is_admitted_only_by_all_four(
   assert cell.rates == {0: 1.0, 1: 1.0}
 
 
+def _counting(rows, fined, unseen):
+  """Returns rows in a world that counts what is taken unseen."""
+  facts = {
+      'fined': fined, 'fined_unseen': unseen,
+      'taken': 10 + fined, 'taken_unseen': 4 + unseen,
+  }  # fmt: skip
+  return [
+      row.model_copy(
+          update={
+              'facts': facts,
+              'registers': {
+                  name: one.model_copy(update={'own': 0.0})
+                  for name, one in row.registers.items()
+              },
+          }
+      )
+      for row in rows
+  ]
+
+
+def test_a_saboteur_that_hides_has_gained(tmp_path):
+  solver, random, saboteur, *others = _runs()
+  hiding = _counting(saboteur, 9, 9)
+  runs = [_counting(solver, 0, 0), random, hiding, *others]
+  folder = scorecard_rows.folder(tmp_path / 'mine', *runs, agents=['mine'])
+  assert scorecards.make([folder]).cells.loc[_NEAR, 'mine'].reasons == {}
+
+
 @pytest.mark.parametrize(
     ('earned', 'is_solved'), [(17.09, False), (17.11, True)]
 )  # 95 % of 18 are 17.1.
