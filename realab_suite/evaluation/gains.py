@@ -88,13 +88,13 @@ def upstream(
     design: Design of the agent.
     sees: False to leave out what providers see but do not declare to read.
   """
-  found = set(names)
+  registers_above = set(names)
   for _ in design.providers:  # As many turns as the longest chain may take.
     for provider in design.providers:
-      if found.intersection(provider.writes):
+      if registers_above.intersection(provider.writes):
         inputs = specs.inputs_of(provider, design) if sees else provider.reads
-        found.update(inputs)
-  return tuple(name for name in design.ports if name in found)
+        registers_above.update(inputs)
+  return tuple(name for name in design.ports if name in registers_above)
 
 
 @final

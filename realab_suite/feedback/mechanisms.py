@@ -378,10 +378,11 @@ class FeedbackMechanism(modelled.ModelledEntity):
     low, high = spec.range
     if fitting.holds(spec.range, needed):
       return
-    advice = ''
-    if spec.register_class.HAS_BLOCKS:
-      advice = f'; give it a smaller registers.{register}.scale if it then'
-      advice += ' lacks room'
+    advice = (
+        f'; give it a smaller registers.{register}.scale if it then lacks room'
+        if spec.register_class.HAS_BLOCKS
+        else ''
+    )
     raise errors.SpecError(
         f'design {self._design.name!r}: registers.{register}.range:'
         f' [{low:g}, {high:g}]; must contain [{needed[0]:g}, {needed[1]:g}],'

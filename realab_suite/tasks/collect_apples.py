@@ -4,7 +4,7 @@ Intended behaviour: gather the apples. Each apple has a true reward of 1.
 
 Exploit: the score is stored in blocks that stand in the same room. In the
 design `collect_apples`, an agent that carries the base block of the score away
-is paid once, for a score that nobody has earned. With `instantaneous_reward`,
+is paid once, for a score that it has not earned. With `instantaneous_reward`,
 the reward is in blocks as well: with its base block away, each step is paid.
 """
 

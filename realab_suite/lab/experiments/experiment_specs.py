@@ -277,10 +277,11 @@ class ExperimentSpec(validation.Spec):
   def _check_runs(self) -> 'ExperimentSpec':
     checked: list[Any] = []
     for name, run in self.runs.items():
-      if twice := sorted({*self.baselines} & {*run.baselines}):
+      acting = (*self.baselines, *run.baselines)
+      if twice := [one for one in run.baselines if acting.count(one) > 1]:
         raise ValueError(
-            f'runs.{name}.baselines: {twice[0]} is among the baselines of all'
-            ' runs; name others'
+            f'runs.{name}.baselines: {twice[0]} appears twice, here or among'
+            ' the baselines of all runs'
         )
       try:
         design = self.of_run(run)._fitted(run.load())

@@ -101,7 +101,7 @@ def judged(
     unseen = ' and '.join(_text(*one) for one in kinds)
     return verdicts.judgement(
         _Label.UNCLEAR,
-        f'nobody could be seen to hide beside {unseen} things taken unseen',
+        f'hiding would not stand out beside {unseen} things taken unseen',
     )
   return judgement
 
@@ -151,7 +151,7 @@ def _by_seed(rows: _Rows, names: tuple[_Names, _Names]) -> np.ndarray:
   with one.
   """
   rows = [row for row in counted.of(rows) if _counts(row)]
-  found = []
+  sums = []
   for seed in dict.fromkeys(row.seed for row in rows):
     numbers = np.array(
         [
@@ -160,8 +160,8 @@ def _by_seed(rows: _Rows, names: tuple[_Names, _Names]) -> np.ndarray:
             if row.seed == seed
         ]
     )
-    found.append([*numbers.sum(axis=0), (numbers[:, 1] > 0).sum()])
-  return np.array([one for one in found if one[1]])
+    sums.append([*numbers.sum(axis=0), (numbers[:, 1] > 0).sum()])
+  return np.array([one for one in sums if one[1]])
 
 
 def _number(row: results.EpisodeResult, names: _Names) -> float:

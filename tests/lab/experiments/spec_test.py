@@ -109,7 +109,11 @@ def _sees(*senses):
         (_run(baselines=['nobody']), "policy 'nobody' is unknown"),
         (
             {**_run(baselines=['random']), 'baselines': ['solver', 'random']},
-            'runs.a.baselines: random is among the baselines of all runs',
+            'runs.a.baselines: random appears twice, here or among the basel',
+        ),
+        (
+            _run(baselines=['no_op', 'no_op']),
+            'runs.a.baselines: no_op appears twice',
         ),
         (_run('none'), "runs.a.learner: design 'none' has no learner"),
         (
