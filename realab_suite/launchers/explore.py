@@ -66,10 +66,13 @@ def _policy_name(env: Any) -> str:
   """Returns the policy of the flags, or else a saboteur of the world.
 
   Random actions are shown where the world has no saboteur, or where the design
-  has no register to attack.
+  has no feedback register, or no block to move.
   """
   saboteurs = getattr(env.task, 'SABOTEURS', ())
-  is_attackable = bool(env.mechanism.design.names('feedback'))
+  mechanism = env.mechanism
+  is_attackable = bool(mechanism.design.names('feedback')) and any(
+      register.blocks for register in mechanism.registers.values()
+  )
   default = saboteurs[0] if saboteurs and is_attackable else flags.RANDOM
   return str(flags.POLICY.value or default)
 

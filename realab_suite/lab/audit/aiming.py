@@ -183,7 +183,8 @@ def make_policy(
     episode: Number of the episode.
 
   Raises:
-    SpecError: If the policy or the register does not exist.
+    SpecError: If the policy or the register does not exist, or the register
+      has no blocks.
   """
   name = in_world(name, getattr(env.task, 'SOLVER', None))
   if not (takes := _aims(name)):
@@ -223,7 +224,8 @@ def make_batch_policy(
     num_envs: Number of worlds.
 
   Raises:
-    SpecError: If the policy does not exist, or the design has no register.
+    SpecError: If the policy does not exist, or the design has no register with
+      blocks.
   """
   name = in_world(name, world.solver)
   if not _aims(name):
@@ -257,7 +259,7 @@ def _first_target(
   """Returns the block that a policy moves; see `make_policy`.
 
   Raises:
-    SpecError: If there is no such register.
+    SpecError: If there is no such register, or it has no blocks.
   """
   design, known = env.mechanism.design, env.mechanism.registers
   register = _default_target(design) if target is None else target
@@ -266,7 +268,13 @@ def _first_target(
         f'policy {name!r} attacks a register, and design {design.name!r} has'
         f' no {register or "feedback register"!r}; it has {sorted(known)}'
     )
-  return targets(env, [register])[0]
+  found = targets(env, [register])
+  if not found:
+    raise errors.SpecError(
+        f'policy {name!r} moves a block, and register {register!r} of design'
+        f' {design.name!r} has none; name another policy'
+    )
+  return found[0]
 
 
 def _default_target(design: specs.DesignSpec) -> str:

@@ -676,8 +676,8 @@ class _Case:
     numbers = {self._run.evaluation_seed(seed) for seed in seeds}
     rows = [row for row in self._all_rows if row.seed in numbers]
     name, control = self._study.control(self._run)
-    run = self._study.runs.get(name or '')
-    is_transplant = run is not None and run.role is Role.CONTROL
+    run = self._study.runs.get(name or '', self._run)
+    is_transplant = (self._run.role, run.role) == (Role.AGENT, Role.CONTROL)
     return hiding.judged(
         judgement, rows, control, is_transplant, self._run.stake, level
     )

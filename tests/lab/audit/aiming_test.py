@@ -1,5 +1,6 @@
 """Tests of the blocks that are attacked, and of the directions."""
 
+import contextlib
 import math
 
 import numpy as np
@@ -146,6 +147,13 @@ def test_only_a_policy_that_needs_an_aim_needs_a_register(env):
   assert isinstance(policy, simple.NoOp)
   with pytest.raises(errors.SpecError, match="no 'rewrad'"):
     aiming.make_policy('aimed_in_a_test', env, 'rewrad', 0)
+
+
+@pytest.mark.parametrize('world', ['off_switch', 'supervised_room'])
+def test_a_saboteur_needs_a_register_with_blocks(world):
+  with contextlib.closing(suite.load(world, 'standard', design=world)) as env:
+    with pytest.raises(errors.SpecError, match='moves a block'):
+      aiming.make_policy('carrying_saboteur', env, None, 0)
 
 
 @pytest.mark.parametrize(

@@ -98,6 +98,11 @@ def test_a_place_explains_what_is_unseen_unless_its_twin_is_elsewhere():
   runs = {**beside.runs, 'control': transplant}
   learned = study.judge(dataclasses.replace(beside, runs=runs))
   assert set(learned.loc['mine', 'label']) == {'hides'}
+  # It is no twin of a scripted policy beside that learner.
+  scripted = dataclasses.replace(runs['mine'], role=study.Role.BASELINE)
+  runs['mine'] = dataclasses.replace(scripted, baseline='control')
+  judged = study.judge(dataclasses.replace(beside, runs=runs))
+  assert judged.loc[('mine', 'all'), 'label'] == 'unclear'
 
 
 @pytest.mark.parametrize(
