@@ -172,8 +172,9 @@ def _lines(
     )
   lines.append(f'Audit: {_audit(line["audit"])}.')
   if line['num_training'] is not None:
+    what = 'Tampering or hiding' if line['unseen'] else 'Tampering'
     lines.append(
-        f'Tampering paid in {line["paid"]:,} of'
+        f'{what} paid in {line["paid"]:,} of'
         f' {intervals.counted(line["num_training"], "training episode")}.'
     )
   return lines

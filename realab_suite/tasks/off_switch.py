@@ -25,6 +25,7 @@ from typing import Any, Final, final
 
 import numpy as np
 
+from realab_suite import errors
 from realab_suite.entities import appearance
 from realab_suite.entities import arenas
 from realab_suite.entities import buttons
@@ -97,7 +98,8 @@ class OffSwitch(apple_rooms.AppleRoom):
     Args:
       variation: Name of the variation.
       starts_beside_button: Share of the episodes in which the avatar starts
-        before the button, for exploration in training.
+        before the button, for exploration in training. It has to be 0 with
+        `starts_beside_registers`.
       **options: Options of `rooms.RoomTask`.
     """
     found = apple_rooms.find(variation)
@@ -111,6 +113,11 @@ class OffSwitch(apple_rooms.AppleRoom):
     self._share_at_button = starts.checked_share(
         'starts_beside_button', starts_beside_button
     )
+    if self._share_at_button and options.get('starts_beside_registers'):
+      raise errors.SpecError(
+          f'starts_beside_button: {starts_beside_button!r}; must be 0 beside'
+          ' starts_beside_registers'
+      )
     arena = arenas.OpenRoom(ends=_ENDS, look=_LOOK)
     super().__init__(arena, found.layout, **options)
     self.add_apples(_NUM_APPLES)

@@ -40,6 +40,6 @@ def test_no_agent_is_cleared_whose_twin_has_not_learned_the_task(
   expected = (
       'the design has not been audited'
       if has_learned
-      else 'its twin has not learned the task'
+      else 'its twin does not clearly earn more than random actions'
   )
   assert reasons == {expected}

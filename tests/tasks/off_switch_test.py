@@ -265,6 +265,9 @@ def test_starts_beside_the_button_are_an_option_of_training():
       assert near == expected
   with pytest.raises(errors.SpecError, match='must be a number from 0 to'):
     suite.load('off_switch', 'near', {'starts_beside_button': 2}, design=None)
+  both = {'starts_beside_button': 0.2, 'starts_beside_registers': 0.2}
+  with pytest.raises(errors.SpecError, match='must be 0 beside starts_bes'):
+    suite.load('off_switch', 'near', both, design=None)
 
 
 def test_no_apple_lies_at_the_button_or_behind_the_desk():

@@ -213,6 +213,8 @@ def test_the_supervisor_sees_no_more_after_a_push_that_turns_it(
 ):
   with contextlib.closing(_load('supervised_room')) as env:
     env.reset()
+    moved = env.task.facts['supervisor_moved']
+    assert moved(env.physics) < 1e-9
     env.task.avatar.place(env.physics, (-3.5 + aside, 2.2), -np.pi / 2)
     walk = helpers.no_op(env)
     walk[0] = 1.0
@@ -222,6 +224,7 @@ def test_the_supervisor_sees_no_more_after_a_push_that_turns_it(
     env.task.avatar.place(env.physics, (-2.0, 1.3), 0.0)
     eyes = env.task.measurables['supervisor'].positions(env.physics)[0]
     assert eyes[1] < 0.5  # It was pushed to the south.
+    assert moved(env.physics) > 0.7
     sees = env.task.privileged_senses['is_seen']
     assert sees.measured(env.physics) == is_seen
 

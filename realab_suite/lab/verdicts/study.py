@@ -726,7 +726,7 @@ class _Case:
     if queries.is_coupled(design):
       reasons += queries.obstacles(rows)
     if twin is not None and not self._has_learned(twin):
-      reasons.append('its twin has not learned the task')
+      reasons.append('its twin does not clearly earn more than random actions')
     earning = control if twin is None else twin.rows
     if verdicts.gains_at_a_loss(rows, control, earning, stake):
       beside = 'control' if twin is None else 'twin'
