@@ -19,7 +19,6 @@ from realab_suite.config import validation
 from realab_suite.engine import arguments
 from realab_suite.evaluation import actors
 from realab_suite.feedback import specs
-from realab_suite.lab.audit import aiming
 from realab_suite.tasks import registry
 
 _Count = Annotated[int, pydantic.Field(ge=1, le=10**10)]
@@ -326,17 +325,14 @@ class ExperimentSpec(validation.Spec):
   def _check_world(self, design: specs.DesignSpec) -> None:
     """Checks that the world of a run can be loaded, and its policies can act.
 
-    A world with the default arguments is not loaded for its solver and random
-    actions, which can act in it.
+    A world with the default arguments is not loaded.
 
     Raises:
       SpecError: If not.
     """
     scripted = self.scripted
     is_default = (
-        not self.task_kwargs
-        and self.environment_kwargs == EnvironmentKwargs()
-        and {*scripted.values()} <= {self.world.solver, 'random'}
+        not self.task_kwargs and self.environment_kwargs == EnvironmentKwargs()
     )
     if is_default and not self.training.tasks and not self.training.task_kwargs:
       return
@@ -361,8 +357,7 @@ class ExperimentSpec(validation.Spec):
       return
     with contextlib.closing(self.world.load(design, 0)) as env:
       for policy in scripted.values():
-        acting = aiming.make_policy(policy, env, None, 0)
-        actors.PrivilegedSenses(acting, env)
+        actors.PrivilegedSenses(policies.make(policy), env)
 
   @property
   def designs(self) -> Mapping[str, specs.DesignSpec]:
@@ -403,19 +398,13 @@ class ExperimentSpec(validation.Spec):
     """Names of the policies of the baselines, by the names of the baselines.
 
     Raises:
-      SpecError: If the solver is a baseline, and the task has none or it is
-        another one as well.
+      SpecError: If the solver is a baseline, and the task has none.
     """
     solver = self.world.solver
     if SOLVER in self.baselines and solver is None:
       raise errors.SpecError(
           f'baselines: {SOLVER}: {self.task} names no solver; name other'
           ' registered policies'
-      )
-    if SOLVER in self.baselines and solver in self.baselines:
-      raise errors.SpecError(
-          f'baselines: {SOLVER} and {solver}, which are one policy; leave one'
-          ' out'
       )
     return {
         name: solver if name == SOLVER and solver else name

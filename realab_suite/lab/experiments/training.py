@@ -5,7 +5,7 @@ A checkpoint contains the state of the learner, and new worlds begin after it;
 lines that were written after it are removed.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import contextlib
 import dataclasses
 import os
@@ -20,6 +20,7 @@ from realab_suite import sources
 from realab_suite.engine import batch_environment
 from realab_suite.engine import batch_time_steps
 from realab_suite.engine import seeding
+from realab_suite.evaluation import actors
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import monitors
@@ -187,15 +188,16 @@ def check_learners(planned: Iterable[jobs.Job], experiment: str) -> None:
 
 
 def rehearse(
-    planned: Iterable[jobs.Job],
+    planned: Sequence[jobs.Job],
     experiment: str,
     say: Say = lambda line: None,
 ) -> None:
-  """Makes the learner of each run once, before any job starts.
+  """Makes what acts in each run once, before any job starts.
 
-  So a trusted policy of other actions is refused at once, and not hours later,
-  when its job starts. Nothing is checked where the packages of learners are not
-  installed; of runs that learn from data, only the options are.
+  So a saboteur that finds no block, or a trusted policy of other actions, is
+  refused at once, and not hours later, when its job starts. Learners are not
+  checked where their packages are not installed; of runs that learn from data,
+  only the options are.
 
   Args:
     planned: The jobs.
@@ -203,10 +205,17 @@ def rehearse(
     say: Called with a line on the progress, after every ten learners.
 
   Raises:
-    SpecError: As `check_learner` does, or if a learner does not fit its worlds.
+    SpecError: As `check_learner` does, or if a learner does not fit its worlds,
+      or a scripted policy cannot act in its world.
   """
   learners = _learners(planned, experiment)
   check_learners(learners.values(), experiment)
+  for place, job in _foreign(planned, experiment).items():
+    with _naming(place), contextlib.closing(
+        job.experiment.world.load(job.design, 0)
+    ) as env:
+      policy = aiming.make_policy(job.kind, env, None, 0)
+      actors.PrivilegedSenses(policy, env)
   if requirements.missing('jax', 'equinox', 'optax', extra='agents'):
     return
   for number, (place, job) in enumerate(learners.items()):
@@ -227,6 +236,17 @@ def _learners(
   """Returns one job of each learner, by its place in an experiment."""
   return {
       f'{experiment}: runs.{job.run}': job for job in planned if not job.policy
+  }
+
+
+def _foreign(
+    planned: Iterable[jobs.Job], experiment: str
+) -> dict[str, jobs.Job]:
+  """Returns jobs of policies that may be unfit for their worlds, by place."""
+  return {
+      f'{experiment}: baselines: {job.run}': job
+      for job in planned
+      if job.policy not in (None, 'random', job.experiment.world.solver)
   }
 
 

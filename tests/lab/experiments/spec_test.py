@@ -14,7 +14,6 @@ from realab_suite.tasks import unlock_door
 
 _FOLDER = pathlib.Path(__file__).parents[3] / 'configs' / 'experiments'
 _FILES = sorted(_FOLDER.glob('*.yaml'))
-_CARRIES = 'carrying_saboteur'
 _SMALL = {
     'schema': 1,
     'name': 'small',
@@ -115,18 +114,6 @@ def _sees(*senses):
         (
             _run(baselines=['no_op', 'no_op']),
             'runs.a.baselines: no_op appears twice',
-        ),
-        (
-            _run(baselines=['button_saboteur']),
-            "runs.a: policy ButtonSaboteur reads ['button', 'apples'] from the",
-        ),
-        (
-            _run('off_switch', task='off_switch.near', baselines=[_CARRIES]),
-            "runs.a: policy 'carrying_saboteur' moves a block, and register",
-        ),
-        (
-            {'baselines': ['solver', 'apple_seeker']},
-            'baselines: solver and apple_seeker, which are one policy',
         ),
         (_run('none'), "runs.a.learner: design 'none' has no learner"),
         (

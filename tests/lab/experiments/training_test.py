@@ -394,6 +394,25 @@ def test_a_rehearsal_of_many_learners_says_how_far_it_is():
   assert said == [f'{n} of 21 learners are checked' for n in (10, 20)]
 
 
+@pytest.mark.parametrize(
+    ('task', 'policy', 'complaint'),
+    [
+        ('unlock_door', 'button_saboteur', r"reads \['button', 'apples'\]"),
+        ('off_switch', 'carrying_saboteur', 'moves a block, and register'),
+    ],
+)
+def test_a_policy_that_cannot_act_in_its_world_is_refused_at_once(
+    task, policy, complaint
+):
+  run = {'design': task, 'task': f'{task}.near'}
+  experiment = experiment_specs.load(
+      {**_SMALL, 'runs': {'mine': run}, 'baselines': ['solver', policy]}
+  )
+  found = f'exp.yaml: baselines: mine.{policy}: policy .* {complaint}'
+  with pytest.raises(errors.SpecError, match=found):
+    training.rehearse(jobs.plan(experiment), 'exp.yaml')
+
+
 def test_every_machine_of_a_run_is_recorded_once(tmp_path, monkeypatch):
   job = _job()
 
