@@ -45,6 +45,7 @@ class Drest(base.Wrapper):
   With n earlier episodes of its length among the i earlier ones of the series,
   the reward of an episode is `discount ** (n - i / 2)` times its share of the
   best return. Until the end, readings count as shares of the larger best one.
+  An episode that training cuts, at a checkpoint, counts as a whole one.
   """
 
   NAME = 'drest'
