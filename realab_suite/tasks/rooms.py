@@ -55,12 +55,13 @@ class RoomTask(base.Task):
         'starts_beside_registers', starts_beside_registers
     )
     self._schedule = starts.checked_schedule(starts_on_the_way)
-    has_starts = type(self).start_ahead is not base.Task.start_ahead
-    most = 1 - self._share_beside if has_starts else 0
-    if self._schedule.largest_share > most:
+    share, most = self._schedule.largest_share, 1 - self._share_beside
+    refusal = f'starts_on_the_way: share {share:g}; must be'
+    if share and type(self).start_ahead is base.Task.start_ahead:
+      raise errors.SpecError(f'{refusal} 0, because this world has none')
+    if share > most:
       raise errors.SpecError(
-          f'starts_on_the_way: share {self._schedule.largest_share:g}; must be'
-          f' at most {most:g} in this world'
+          f'{refusal} at most {most:g}, which starts_beside_registers leaves'
       )
     self._starts: starts.Starts | None = None
     arena.offer(

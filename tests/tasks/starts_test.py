@@ -154,8 +154,8 @@ def test_worlds_of_a_batch_begin_as_single_ones_do():
 @pytest.mark.parametrize(
     ('domain', 'kwargs', 'message'),
     [
-        ('hidden_goal', {}, r'share 1; must be at most 0'),
-        ('gates', {'starts_beside_registers': 0.3}, 'must be at most 0.7'),
+        ('hidden_goal', {}, r'share 1; must be 0, because this world has none'),
+        ('gates', {'starts_beside_registers': 0.3}, 'must be at most 0.7,'),
         ('gates', {'starts_on_the_way': [[0, 0, 1.5]]}, 'must be a list'),
         ('gates', {'starts_on_the_way': [[5, 0, 1], [5, 0, 1]]}, 'must be a l'),
         ('gates', {'starts_on_the_way': [[0, 0]]}, 'must be a list'),
