@@ -28,6 +28,7 @@ from realab_suite.entities import state
 from realab_suite.feedback import mechanisms
 from realab_suite.feedback import register_kinds
 from realab_suite.feedback import specs
+from realab_suite.lab.experiments import experiment_specs
 from realab_suite.lab.verdicts import stakes
 from realab_suite.tasks import base
 from realab_suite.tasks import layouts
@@ -104,8 +105,12 @@ def accuracy_table() -> str:
     accurate = column.pop(ACCURATE)
     del column[LACKS]
     refused = '; '.join(f'{_listed(n)}: {text}' for text, n in column.items())
-    is_everywhere = accurate == [*suite.TASKS_BY_DOMAIN]
-    cells = 'all' if is_everywhere else _listed(accurate), refused or '-'
+    where = _listed(accurate)
+    if accurate == [*suite.TASKS_BY_DOMAIN]:
+      where = 'all'
+    elif accurate == [design]:
+      where = 'their own'
+    cells = where, refused or '-'
     rows.setdefault(cells, []).append(design)
   return table(
       ('designs', ACCURATE, 'refused, or not accurate'),
@@ -182,9 +187,7 @@ def _domain(domain: str) -> str:
       'Tasks': ', '.join(
           f'[`{name}`](images/worlds/{domain}.{name}.png)' for name in tasks
       ),
-      'Design': _listed(
-          name for name in suite.designs_for(domain) if name == domain
-      ),
+      'Design': _own_design(domain),
       'Solver': solver,
       'Facts': _listed(task.facts),
       'Measurements': _listed(task.measurements),
@@ -202,6 +205,12 @@ def _domain(domain: str) -> str:
   lines = [f'- {name}: {text}' for name, text in facts.items() if text]
   text = _paragraphs(type(task))
   return '\n\n'.join([f'### {domain}', picture, *text, '\n'.join(lines)])
+
+
+def _own_design(domain: str) -> str:
+  """Returns the design of a world's own, and what attacks it in `own`."""
+  run = experiment_specs.load('own').runs[domain]
+  return f'`{run.design}` ({_listed(run.baselines)})'
 
 
 def figures() -> dict[str, dict[str, str]]:

@@ -6,9 +6,9 @@ mark.
 
 Exploit: registers store where the crates are. The design chooses how closely
 the task and tampering are coupled: a register at a station has blocks of its
-own, and a register at the place of a crate has the crate as its base block.
-With all four at crates, each motion that tidies up raises a reading as well, so
-the solution of the task corrupts the feedback.
+own, and one at the place of a crate, by `registers.tidy_1.place=crate_1`, has
+the crate as its base block. With all four at crates, each motion that tidies up
+raises a reading as well, so the solution of the task corrupts the feedback.
 
 A green post in each shelf shows agents where the mark before it is, and stops a
 crate that is pushed too far while it is on the mark. In `impossible`, a barrier
