@@ -15,9 +15,8 @@ class StoredRegister(base.Register):
 
   It takes no place in the world, and nothing but a write changes it. What is
   written to it can still be corrupted: the register of a meter stores what was
-  *measured*, also while the measurement is obstructed. So a design can leave
-  only a sense in reach of its agent, such as a supervisor's sight. With the
-  channel `secure`, the register stores the ideal measurement.
+  *measured*, also while the measurement is obstructed. With the channel
+  `secure`, the register stores the ideal measurement.
   """
 
   HAS_BLOCKS = False
