@@ -19,7 +19,7 @@ import realab_suite as realab
 from realab_suite.reports import plots
 
 _SHARES = {point: point / 4 for point in range(5)}
-# Runs by what is added to their names, with a text and a marker.
+# Names of runs, without their points, with a text and a marker.
 _ACTORS = {
     'reward_{}': ('reward learner', 'o'),
     'reward_{}.transplant': ('twin, with the blocks in reach', '^'),

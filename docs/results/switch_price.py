@@ -1,4 +1,4 @@
-"""What it is worth to pull out the cap of an operator's button, in Markdown.
+"""Prints the price of pulling out the cap of an operator's button, in Markdown.
 
 Run from the root of the repository, about two minutes:
 

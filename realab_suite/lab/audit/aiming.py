@@ -268,13 +268,13 @@ def _first_target(
         f'policy {name!r} attacks a register, and design {design.name!r} has'
         f' no {register or "feedback register"!r}; it has {sorted(known)}'
     )
-  found = targets(env, [register])
-  if not found:
+  block_targets = targets(env, [register])
+  if not block_targets:
     raise errors.SpecError(
         f'policy {name!r} moves a block, and register {register!r} of design'
         f' {design.name!r} has none; name another policy'
     )
-  return found[0]
+  return block_targets[0]
 
 
 def _default_target(design: specs.DesignSpec) -> str:

@@ -408,8 +408,8 @@ def test_a_policy_that_cannot_act_in_its_world_is_refused_at_once(
   experiment = experiment_specs.load(
       {**_SMALL, 'runs': {'mine': run}, 'baselines': ['solver', policy]}
   )
-  found = f'exp.yaml: baselines: mine.{policy}: policy .* {complaint}'
-  with pytest.raises(errors.SpecError, match=found):
+  message = f'exp.yaml: baselines: mine.{policy}: policy .* {complaint}'
+  with pytest.raises(errors.SpecError, match=message):
     training.rehearse(jobs.plan(experiment), 'exp.yaml')
 
 

@@ -91,20 +91,20 @@ def test_a_place_explains_what_is_unseen_unless_its_twin_is_elsewhere():
       ' taken unseen',
   )
   twin = _rows('control', 0, 0)
-  beside = made_studies.of(
+  made = made_studies.of(
       {'control': twin, 'mine': _rows('mine', *_EAST)},
       'control', ['mine'], scorecard_rows.design(),
   )  # fmt: skip
   transplant = dataclasses.replace(
-      beside.runs['control'], role=study.Role.CONTROL
+      made.runs['control'], role=study.Role.CONTROL
   )
-  runs = {**beside.runs, 'control': transplant}
-  learned = study.judge(dataclasses.replace(beside, runs=runs))
+  runs = {**made.runs, 'control': transplant}
+  learned = study.judge(dataclasses.replace(made, runs=runs))
   assert set(learned.loc['mine', 'label']) == {'hides'}
   # It is no twin of a scripted policy beside that learner.
   scripted = dataclasses.replace(runs['mine'], role=study.Role.BASELINE)
   runs['mine'] = dataclasses.replace(scripted, baseline='control')
-  judged = study.judge(dataclasses.replace(beside, runs=runs))
+  judged = study.judge(dataclasses.replace(made, runs=runs))
   assert judged.loc[('mine', 'all'), 'label'] == 'unclear'
 
 
