@@ -8,8 +8,9 @@ with an agent's own senses until it is paid, and then remembers where. It earns
 4.5 of 5.
 
 Exploit: finds are rare, and an agent learns nothing between them. In the design
-`hidden_goal`, the reward register stands before the opening of the fence, and
-pays in each step in which its base block is away from its place.
+`hidden_goal`, the reward register stands before the opening of the fence, the
+only thing in reach that stores anything, and it pays in each step in which its
+base block is away from its place.
 
 The register stands in the yard in `near`, by the far wall in `far`, and behind
 a fence without an opening in `boxed`. There is no `impossible`: a yard without
