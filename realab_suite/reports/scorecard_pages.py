@@ -28,6 +28,7 @@ _PANELS = (
 # Sizes in inches: width of a cell, height of a line, and margin.
 _WIDTH, _LINE, _MARGIN = 1.3, 0.12, 2.2
 _LETTERS = 21  # In a line of a cell.
+_MANY = 8  # Designs for which one line of panels would be too wide.
 _DARK = 0.6
 _OF_CELL = [name for name, *_ in _PANELS]
 
@@ -176,23 +177,36 @@ def _csv_text(card: scorecards.Scorecard) -> str:
 
 
 def draw(card: scorecards.Scorecard) -> figure.Figure:
-  """Returns the heat map: scores, those of twins, and hack rates."""
-  columns, rows = list(card.columns), card.worlds
-  width = len(_PANELS) * len(columns) * _WIDTH + _MARGIN
-  texts = (_drawn(cell, 'rates') for _, cell in card.cells.iterrows())
+  """Returns the heat map: scores, those of twins, and hack rates.
+
+  It has the designs of which a cell counts, or all if none does. Panels of many
+  designs stand one below the other.
+  """
+  columns = [
+      column
+      for column, cells in card.columns.items()
+      if not all(cells['reasons'])
+  ] or list(card.columns)
+  drawn = card.cells[card.cells.index.isin(columns, level='column')]
+  seen = set(drawn.index.unique('world'))
+  rows = [world for world in card.worlds if world in seen]
+  texts = (_drawn(cell, 'rates') for _, cell in drawn.iterrows())
   lines = max(text.count('\n') for text in texts) + 2
+  across = 1 if len(columns) > _MANY else len(_PANELS)
+  down = len(_PANELS) // across
+  width = across * len(columns) * _WIDTH + _MARGIN
+  height = down * (len(rows) + 1) * lines * _LINE + _MARGIN
   head = f'suite {card.version}; hatched cells do not count'
+  if left := len(card.columns) - len(columns):
+    head += f'; {left} designs without one that counts are in {NAME}.md'
   style = {**plots.STYLE, 'axes.grid': False}
   with matplotlib.rc_context(style):
-    canvas = figure.Figure(
-        (width, (len(rows) + 1) * lines * _LINE + _MARGIN),
-        layout='constrained',
-    )
+    canvas = figure.Figure((width, height), layout='constrained')
     legend = '\n'.join([head, *_legend(card)])
     canvas.supxlabel(legend, fontsize=7, x=0.01, ha='left')
-    axes = canvas.subplots(1, len(_PANELS), sharey=True)
+    axes = canvas.subplots(down, across, sharey=True)
     for ax, (name, title, colours) in zip(axes, _PANELS, strict=True):
-      for (world, column), cell in card.cells.iterrows():
+      for (world, column), cell in drawn.iterrows():
         place = columns.index(column), rows.index(world)
         _draw_cell(ax, place, cell, name, matplotlib.colormaps[colours])
       for x, column in enumerate(columns):

@@ -105,8 +105,12 @@ class Scorecard:
 
   @property
   def worlds(self) -> list[str]:
-    """Names of the worlds."""
-    return list(self.cells.index.unique('world'))
+    """Names of the worlds; those of a domain stand together."""
+    worlds_by_domain: dict[str, list[str]] = {}
+    for world in self.cells.index.unique('world'):
+      domain, _ = task_names.split(world)
+      worlds_by_domain.setdefault(domain, []).append(world)
+    return [world for each in worlds_by_domain.values() for world in each]
 
   @property
   def columns(self) -> dict[str, pd.DataFrame]:
@@ -212,8 +216,8 @@ def make(
 
   Raises:
     ResultsError: If a folder has no results or is given twice, a file is
-      damaged, rows are missing or belong to another design, two folders have
-      the same cell, or the rows are of different dynamics or code.
+      damaged, rows are missing or belong to another design, names do not tell
+      two cells apart, or the rows are of different dynamics or code.
   """
   actors: list[_Actor] = []
   notes: list[str] = []
@@ -266,14 +270,29 @@ def _shown(actors: Sequence[_Actor]) -> dict[_Place, _Actor]:
     if place in shown:
       if actor.role == 'scripted':  # It acts in other designs as well.
         continue
-      if actor.source != (other := shown[place].source):
-        raise errors.ResultsError(
-            f'{actor.source}: {" x ".join(place)} is in {other} as well; must'
-            ' be in one of them'
-        )
-      place = place[0], f'{actor.column} ({actor.run.name})'
+      place = _another_place(actor, shown)
     shown[place] = actor
   return shown
+
+
+def _another_place(actor: _Actor, shown: Mapping[_Place, _Actor]) -> _Place:
+  """Returns the place of an actor whose own one is taken.
+
+  Raises:
+    ResultsError: If no name tells the two apart.
+  """
+  world, column = actor.place
+  names = [pathlib.Path(actor.source).name, actor.run.name]
+  if actor.source == shown[actor.place].source:
+    del names[0]
+  for name in names:
+    if (place := (world, f'{column} ({name})')) not in shown:
+      return place
+  raise errors.ResultsError(
+      f'{actor.source}: {world} x {column} is in'
+      f' {shown[actor.place].source} as well; must be in one of them, or in'
+      ' folders and runs of other names'
+  )
 
 
 def _differences(shown: Mapping[_Place, _Actor]) -> Iterator[str]:
@@ -449,8 +468,17 @@ def _of_design(found: study.Study, run: study.Run) -> tuple[str, str]:
     if spec.load().digest() == digest:
       learner = (f'learner.{key}={x}' for key, x in spec.learner.items())
       changes = ', '.join([name, *spec.overrides, *learner])
-      return OWN_DESIGN if name == domain else name, changes
+      column = OWN_DESIGN if name == domain else name
+      return f'{column}{_defence(loaded)}', changes
   return with_digest, with_digest  # A name of the package for something else.
+
+
+def _defence(design: specs.DesignSpec) -> str:
+  """Returns what a learner adds to the column of its design."""
+  learner: Mapping[str, Any] = design.to_mapping().get('learner') or {}
+  if defence := learner.get('defence'):
+    return f' + {defence["kind"]}'
+  return ' + gate' if learner.get('gate') else ''
 
 
 def _actors(found: study.Study) -> Iterator[_Actor]:

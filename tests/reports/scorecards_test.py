@@ -196,17 +196,15 @@ def test_a_comparison_has_a_column_for_each_policy_but_its_controls(tmp_path):
   assert cell.label == 'tampers'
 
 
-def test_two_folders_with_a_cell_of_one_agent_are_refused(tmp_path):
-  one, two = (
+def test_cells_of_one_agent_in_two_folders_have_names_of_their_own(tmp_path):
+  folders = [
       scorecard_rows.folder(tmp_path / name, *_runs(), agents=['mine'])
-      for name in ('one', 'two')
-  )
-  with pytest.raises(errors.ResultsError) as raised:
-    scorecards.make([one, two])
-  assert str(raised.value) == (
-      f'{two}: unlock_door.near x mine is in {one} as well; must be in one'
-      ' of them'
-  )
+      for name in ('one', 'two', 'also/two', 'mine/two')
+  ]
+  columns = scorecards.make(folders[:2]).columns
+  assert [one for one in columns if 'mine' in one] == ['mine', 'mine (two)']
+  with pytest.raises(errors.ResultsError, match='of other names'):
+    scorecards.make(folders)
 
 
 def test_the_version_follows_the_dynamics_and_the_worlds(tmp_path):
