@@ -586,7 +586,9 @@ class _Hall(RoomArena, abc.ABC):
     }
     super()._build(name, look=look)
     for side, (_, doorway, room, middle) in self._SIDES.items():
-      wall, inside = near - _WALL_THICKNESS / 2, near + _SIDE_HALF_WIDTH
+      # Not `near` less half a wall: where a door stands is frozen to the bit.
+      wall = _HALF_WIDTH + _WALL_THICKNESS / 2
+      inside = near + _SIDE_HALF_WIDTH
       for place, distance in ((doorway, wall), (room, inside)):
         spot = _beyond(side, distance, distance, middle, middle)
         self.offer({place: Place(spot.low)})

@@ -204,7 +204,7 @@ class Surroundings:
     """
     if physics.model is not self._model:
       self._resolve(physics)
-    return self._origin + position @ self._axes.T
+    return self._origin + _product(position, self._axes.T)
 
   def in_frame(
       self, physics: protocols.Physics, vector: np.ndarray
@@ -217,7 +217,7 @@ class Surroundings:
     """
     if physics.model is not self._model:
       self._resolve(physics)
-    return vector @ self._axes
+    return _product(vector, self._axes)
 
   def _resolve(self, physics: protocols.Physics) -> None:
     """Finds frame and obstacles in a compiled model, and caches them."""
@@ -344,3 +344,12 @@ class Surroundings:
     return np.append(
         lower.max(axis=0, initial=-np.inf), upper.min(axis=0, initial=np.inf)
     )
+
+
+def _product(vector: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+  """Returns the same as `vector @ matrix`, of 3 rows, for any number of worlds.
+
+  The last bits of a matrix product depend on the number of worlds.
+  """
+  x, y, z = (vector[..., i, np.newaxis] for i in range(3))
+  return x * matrix[0] + y * matrix[1] + z * matrix[2]

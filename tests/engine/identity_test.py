@@ -2,6 +2,7 @@
 
 import itertools
 
+import numpy as np
 import pytest
 
 from realab_suite import suite
@@ -26,6 +27,13 @@ _TURNS = _REWARD._replace(
         'dof=planar',
         'registers.reward.kind=block_orientation',
         'registers.score.kind=block_orientation',
+    )
+)
+# A register along no axis of the room.
+_TURNED = _REWARD._replace(
+    overrides=(
+        'dof=planar',
+        'registers.reward.place={position: [0.8, -2.5], yaw: 2.3}',
     )
 )
 # A provider draws at random in every step, from a large seed.
@@ -85,6 +93,24 @@ def test_a_batch_with_held_blocks_that_turn_equals_its_worlds():
   result = identity.compare(_TURNS, _STEPS)
   assert result.differences == ()
   assert result.num_held > 0
+
+
+def test_a_register_along_no_axis_turns_vectors_alike_in_any_number():
+  vectors = np.random.default_rng(0).normal(size=(identity.NUM_ENVS, 9, 3))
+  env, batch = _TURNED.load(0), _TURNED.load_batch()
+  env.reset()
+  batch.reset()
+  alone, together = (
+      one.mechanism.ports['reward'].blocks[0].surroundings
+      for one in (env, batch)
+  )
+  for name in ('in_frame', 'in_world'):
+    turned = [getattr(alone, name)(env.physics, one) for one in vectors[:, 0]]
+    assert not np.isclose(turned, vectors[:, 0])[:, :2].any()
+    for others in range(1, 10):
+      some = vectors[:, :others].reshape(-1, 3)
+      found = getattr(together, name)(batch.physics, some)
+      assert np.array_equal(found[::others], turned)
 
 
 def test_compared_runs_contain_ends_rewards_and_corruption():

@@ -101,6 +101,13 @@ def test_no_block_flies_out_of_the_room(size, mass, is_guarded):
   assert (num_outside == 0) is is_guarded
 
 
+def test_a_doorway_is_where_published_rows_have_it_to_the_last_digit():
+  # Digests of dynamics do not see a rounding; replays of rows do.
+  assert arenas.TwoRooms().places['doorway'].position == (0.0, 4.1)
+  places = arenas.ThreeRooms().places
+  assert places['east_doorway'].position == (4.1, 1.6)
+
+
 def test_a_small_block_that_is_forced_into_a_wall_comes_back():
   arena = arenas.OpenRoom()
   register = registers.BlockPositionRegister(
