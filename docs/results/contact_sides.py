@@ -67,7 +67,9 @@ def _of_episode(run: study.Run, row: Any) -> dict[str, float]:
     ports = {
         name: port
         for name, port in env.mechanism.ports.items()
-        if port.role in _ROLES and port.blocks
+        if port.role in _ROLES
+        and port.blocks
+        and run.design.channel_of(name) != 'secure'
     }
 
     def see(physics: Any, unused_track: tracking.Track) -> None:

@@ -329,6 +329,18 @@ def test_a_film_needs_a_run_and_a_renderer(monkeypatch, arguments, complaint):
   assert complaint in in_process.complaint(film, *arguments)
 
 
+def test_a_film_shows_the_episode_that_is_named():
+  rows = [types.SimpleNamespace(key=(7, world, 0)) for world in range(12)]
+  run = types.SimpleNamespace(name='reward', rows=rows)
+  assert film._named(run, '7,3,0') is rows[3]
+  with pytest.raises(errors.SpecError) as raised:
+    film._named(run, '7,12,0')
+  assert str(raised.value) == (
+      '--episode=7,12,0: no evaluation episode of reward; must be one of its'
+      ' 12, from 7,0,0 to 7,11,0'
+  )
+
+
 @pytest.mark.skipif(sys.platform != 'linux', reason='EGL exists on Linux')
 @pytest.mark.parametrize(
     ('given', 'display', 'named'),
