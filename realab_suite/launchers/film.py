@@ -3,8 +3,9 @@ r"""Films an evaluation episode of a run: from above, and in the first person.
   python -m realab_suite.launchers.film --input=results/quick --run=reward \
     --video=reward.mp4
 
-It is the valid episode of median corruption, or that of --episode. The input is the folder of a sweep. The episode is repeated from its recorded
-actions, so the learner is not needed.
+It is the valid episode of median corruption, or that of --episode. The input is
+the folder of a sweep. The episode is repeated from its recorded actions, so the
+learner is not needed.
 """
 
 import pathlib
