@@ -128,11 +128,16 @@ class World:
     """Names of policies that move the registers' blocks."""
     return tuple(_task(self.domain, self.task).SABOTEURS)
 
-  @property
-  def scripted(self) -> tuple[str, ...]:
-    """Names of policies to compare: the solver, a saboteur, random actions."""
+  def scripted_in(self, design: specs.DesignSpec) -> tuple[str, ...]:
+    """Returns names of policies to compare in a design.
+
+    They are the solver, a saboteur, and random actions. Where no block can be
+    moved, the saboteur is the world's own, which stands last.
+    """
     solver = () if self.solver is None else (self.solver,)
-    return (*solver, *self.saboteurs[:1], 'random')
+    is_movable = any(map(design.is_movable, design.registers))
+    saboteurs = self.saboteurs[:1] if is_movable else self.saboteurs[-1:]
+    return (*solver, *saboteurs, 'random')
 
   @property
   def action_set(self) -> action_sets.ActionSet:

@@ -14,6 +14,7 @@ import pytest
 import realab_suite
 from realab_suite import errors
 from realab_suite import suite
+from realab_suite import worlds
 from realab_suite.feedback import specs
 from realab_suite.lab.experiments import experiment_specs
 from realab_suite.tasks import apple_rooms
@@ -303,3 +304,15 @@ def test_what_is_misspelt_is_named_with_what_is_like_it(
   with pytest.raises(errors.SpecError) as caught:
     load()
   assert complaint in str(caught.value)
+
+
+def test_the_saboteur_that_is_compared_can_move_something():
+  saboteurs = {}
+  for domain in suite.TASKS_BY_DOMAIN:
+    task = suite.TASKS_BY_DOMAIN[domain][0]
+    world = worlds.World(domain, task)
+    *_, saboteurs[domain], random = world.scripted_in(specs.load(domain))
+    assert random == 'random'
+  assert saboteurs.pop('off_switch') == 'button_saboteur'
+  assert saboteurs.pop('supervised_room') == 'hiding_gatherer'
+  assert set(saboteurs.values()) == {'carrying_saboteur', 'gates_saboteur'}

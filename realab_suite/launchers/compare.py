@@ -28,13 +28,15 @@ def main() -> None:
   from realab_suite.lab.experiments import scripted
 
   world = flags.world()
-  flags.design()  # Refuses a wrong one before anything is written.
+  design = flags.design()  # Refuses a wrong one before anything is written.
   policies = flags.POLICIES.value
+  if policies is None:
+    policies = world.scripted_in(design)
   settings = scripted.Settings(
       world=world,
       design=flags.DESIGN.value or flags.DEFAULT_DESIGN,
       overrides=tuple(flags.SET.value),
-      policies=world.scripted if policies is None else tuple(policies),
+      policies=tuple(policies),
       channels=tuple(flags.CHANNELS.value),
       target=flags.TARGET.value,
       seeds=seeds,

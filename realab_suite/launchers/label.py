@@ -84,11 +84,10 @@ def _scripted(seeds: tuple[int, ...]) -> list[Any]:
   from realab_suite.feedback import specs
 
   world = flags.world()
-  policy_names = flags.POLICIES.value
-  names = world.scripted if policy_names is None else tuple(policy_names)
-  if not names:
+  named = flags.POLICIES.value
+  if named == []:
     return []
-  for policy in names:
+  for policy in named or ():
     policies.POLICIES.get(policy)
   designs = [
       flags.design(os.path.expanduser(design)) for design in _DESIGNS.value
@@ -104,7 +103,7 @@ def _scripted(seeds: tuple[int, ...]) -> list[Any]:
     program.say(f'{design.name}: {why_not or "measuring its stakes"}')
     stake = judging.stakes_of(world, design)
     for twin in of_design:
-      for policy in names:
+      for policy in world.scripted_in(design) if named is None else named:
         program.say(f'{policy} acts in {twin.name} ({twin.channel})')
         run_sources.append(
             sources.of_policy(
