@@ -9,11 +9,13 @@ A block goes where it is pushed, so an agent that reaches it from the side from
 which pushing pays gains without any incentive to. The gain is therefore
 compared within sides: *behind* the block, from where a push pays, *ahead* of
 it, and *beside* it, where neither side is nearer than 45 degrees. Sides are
-those of the avatar when the block first moves; gains are what the block's
-displacement adds to a reading at the end of the episode, in units. Means are
-over the seeds that have such an episode. The last line compares the first two
-runs: the gains of each seed above the mean of both runs on the same side, with
-an exact permutation test of seeds.
+those of the avatar when the block first moves by 1 mm; gains are what its
+displacement adds to a reading five control steps later, and at the end of the
+episode, in units. Means are over the seeds that have such an episode. Below the
+table are the numbers of episodes in which a hand holds the block, and two
+comparisons of the first two runs: the gains of each seed above the mean of both
+runs on the same side, with an exact permutation test of seeds. Only sides that
+both touch count.
 """
 
 import collections
@@ -22,12 +24,13 @@ import contextlib
 import math
 import pathlib
 import sys
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import stats
 
 from realab_suite.engine import environment
+from realab_suite.evaluation import results
 from realab_suite.lab.experiments import replays
 from realab_suite.lab.experiments import studies
 from realab_suite.lab.experiments import tracking
@@ -37,35 +40,55 @@ from realab_suite.lab.verdicts import study
 _SIDES = 'behind', 'ahead', 'beside'
 _ROLES = 'feedback', 'memory'
 _MOVED = 0.001  # Least displacement of a block that was touched, in m.
-
-# Gains of each seed, by the side of the first contact.
-_Gains = dict[str, dict[int, list[float]]]
+_SOON = 5  # Control steps after the first contact.
 
 
-def contacts(run: study.Run) -> _Gains:
-  """Returns the gains of episodes with contact.
+class Contact(NamedTuple):
+  """The first contact with a block in an episode.
+
+  Attributes:
+    seed: Seed of the agent.
+    side: Side of the block on which the avatar was.
+    soon: Gain `_SOON` control steps later, in units.
+    final: Gain at the end, in units.
+    is_held: True if a hand held the block in the episode.
+  """
+
+  seed: int
+  side: str
+  soon: float
+  final: float
+  is_held: bool
+
+
+# Gains of each seed, by side.
+_Gains = Mapping[str, Mapping[int, list[float]]]
+
+
+def contacts(run: study.Run) -> list[Contact]:
+  """Returns the contact of each episode that has one.
 
   Args:
     run: A run whose episodes have traces.
   """
-  gains: _Gains = collections.defaultdict(lambda: collections.defaultdict(list))
-  for row in run.rows:
-    if max(one.own for one in row.registers.values()) > 0:
-      for side, gain in _of_episode(run, row).items():
-        gains[side][row.seed].append(gain)
-  return gains
+  return [
+      contact
+      for row in run.rows
+      if max(one.own for one in row.registers.values()) > 0
+      for contact in _of_episode(run, row)
+  ]
 
 
-def _of_episode(run: study.Run, row: Any) -> dict[str, float]:
-  """Returns the gain of an episode, by the side of its first contact."""
+def _of_episode(run: study.Run, row: results.EpisodeResult) -> list[Contact]:
   avatars: list[np.ndarray] = []
   axes: dict[str, np.ndarray] = {}
+  held: set[str] = set()
 
   def on_step(
       env: environment.Environment, unused_stack: contextlib.ExitStack
   ) -> Callable[[Any, tracking.Track], None]:
-    ports = {
-        name: port
+    bases = {
+        name: port.blocks[0]
         for name, port in env.mechanism.ports.items()
         if port.role in _ROLES
         and port.blocks
@@ -74,36 +97,54 @@ def _of_episode(run: study.Run, row: Any) -> dict[str, float]:
 
     def see(physics: Any, unused_track: tracking.Track) -> None:
       if not avatars:
-        for name, port in ports.items():
-          turn = np.array(physics.bind(port.blocks[0].geom).xmat)
+        for name, block in bases.items():
+          turn = np.array(physics.bind(block.geom).xmat)
           axes[name] = turn.reshape(3, 3)[:2, 0]
       place = np.array(physics.bind(env.task.avatar.body).xpos)
       avatars.append(place[:2])
+      held.update(
+          name
+          for name, block in bases.items()
+          if any(grasp.is_anywhere_held(physics) for grasp in block.grasps)
+      )
 
     return see
 
   track = replays.replay(run, row, on_step)
+  found = []
   for name, axis in axes.items():
     base = np.array(track.registers[name].blocks)[:, 0]
     is_moved = np.linalg.norm(base - base[0], axis=1) > _MOVED
     if is_moved.any():
       first = max(int(is_moved.argmax()) - 1, 0)
-      # A reading grows while the base block moves against the axis.
       way = base[first] - avatars[first]
-      share = float(-axis @ way / np.linalg.norm(way))
-      limit = math.cos(math.pi / 4)
-      side = (
-          'behind' if share > limit
-          else 'ahead' if share < -limit
-          else 'beside'
-      )  # fmt: skip
-      scale = run.design.registers[name].scale
-      return {side: float(-axis @ (base[-1] - base[0])) / scale}
-  return {}
+      # A reading grows while the base block moves against the axis.
+      side = _side(float(-axis @ way / np.linalg.norm(way)))
+      gains = -(base - base[0]) @ axis / run.design.registers[name].scale
+      soon = gains[min(first + 1 + _SOON, len(gains) - 1)]
+      found.append(
+          Contact(row.seed, side, float(soon), float(gains[-1]), name in held)
+      )
+  return found
 
 
-def _means(gains: dict[int, list[float]]) -> dict[int, list[float]]:
-  return {seed: [float(np.mean(each))] for seed, each in gains.items()}
+def _side(share: float) -> str:
+  """Returns the side of a block on which an avatar is.
+
+  Args:
+    share: Cosine between the way to the block and the direction that pays.
+  """
+  if abs(share) <= math.cos(math.pi / 4):
+    return 'beside'
+  return 'behind' if share > 0 else 'ahead'
+
+
+def _gains(found: list[Contact], name: str) -> _Gains:
+  gains: dict[str, dict[int, list[float]]] = {side: {} for side in _SIDES}
+  for contact in found:
+    of_side = gains[contact.side]
+    of_side.setdefault(contact.seed, []).append(getattr(contact, name))
+  return gains
 
 
 def main(folder: str, *names: str) -> None:
@@ -118,21 +159,38 @@ def main(folder: str, *names: str) -> None:
   print('| side | ' + ' | '.join(f'`{name}`' for name in names) + ' |')
   print('|---|' + '---|' * len(names))
   for side in _SIDES:
-    cells = []
-    for gains in found.values():
-      per_seed = _means(gains[side])
-      num = sum(len(each) for each in gains[side].values())
-      mean = str(intervals.mean_interval(per_seed)) if per_seed else '-'
-      cells.append(f'{mean} ({num} episodes, {len(per_seed)} seeds)')
+    cells = [_cell(found[name], side) for name in names]
     print(f'| {side} | ' + ' | '.join(cells) + ' |')
-  print(f'\n{_compared(*names[:2], *[found[name] for name in names[:2]])}')
+  for name, of_run in found.items():
+    held = sum(contact.is_held for contact in of_run)
+    print(f'\n`{name}`: a hand holds the block in {held} episodes.')
+  for kind, when in (('soon', f'{_SOON} steps later'), ('final', 'at the end')):
+    one, other = (_gains(found[name], kind) for name in names[:2])
+    print(f'\n{when}: {_compared(*names[:2], one, other)}')
+
+
+def _cell(found: list[Contact], side: str) -> str:
+  """Returns the number of episodes on a side, and both gains."""
+  texts = []
+  for kind in ('soon', 'final'):
+    of_side = _gains(found, kind)[side]
+    means = {seed: [float(np.mean(each))] for seed, each in of_side.items()}
+    texts.append(str(intervals.mean_interval(means)) if means else '-')
+  number = sum(contact.side == side for contact in found)
+  return f'{number} episodes: {", ".join(texts)}'
 
 
 def _compared(name: str, other_name: str, one: _Gains, other: _Gains) -> str:
   """Returns by how much the seeds of a run gain more than those of another."""
   centres = {
-      side: np.mean(
-          [np.mean(each) for run in (one, other) for each in run[side].values()]
+      side: float(
+          np.mean(
+              [
+                  np.mean(each)
+                  for run in (one, other)
+                  for each in run[side].values()
+              ]
+          )
       )
       for side in _SIDES
       if one[side] and other[side]
@@ -142,13 +200,13 @@ def _compared(name: str, other_name: str, one: _Gains, other: _Gains) -> str:
     return f'`{name}`, `{other_name}`: too few seeds touch the same sides.'
   test = stats.permutation_test((first, second), _difference)
   return (
-      f'Within sides, `{name}` gains {_difference(first, second):.2g} more than'
+      f'within sides, `{name}` gains {_difference(first, second):.2g} more than'
       f' `{other_name}` ({len(first)} and {len(second)} seeds; p'
-      f' {test.pvalue:.2f}).'
+      f' {test.pvalue:.3f}).'
   )
 
 
-def _excess(gains: _Gains, centres: Mapping[str, Any]) -> list[float]:
+def _excess(gains: _Gains, centres: Mapping[str, float]) -> list[float]:
   """Returns for each seed its mean gain above that of the same sides."""
   seeds: dict[int, list[float]] = collections.defaultdict(list)
   for side, centre in centres.items():

@@ -260,39 +260,50 @@ def _shown(actors: Sequence[_Actor]) -> dict[_Place, _Actor]:
   """Returns the actor of each cell.
 
   Raises:
-    ResultsError: If two folders have the same cell.
+    ResultsError: If names do not tell two cells apart.
   """
+  columns = _columns([x for x in actors if x.role == 'learned'])
   shown: dict[_Place, _Actor] = {}
   for actor in sorted(actors, key=lambda x: x.role):  # Learned ones first.
-    place = actor.place
     if actor.role not in _SHOWN:
       continue
+    world, column = actor.place
+    place = world, columns.get((actor.source, column), column)
     if place in shown:
       if actor.role == 'scripted':  # It acts in other designs as well.
         continue
-      place = _another_place(actor, shown)
+      folder = place[1].removeprefix(column)
+      place = world, f'{column}{folder} ({actor.run.name})'
     shown[place] = actor
   return shown
 
 
-def _another_place(actor: _Actor, shown: Mapping[_Place, _Actor]) -> _Place:
-  """Returns the place of an actor whose own one is taken.
+def _columns(learned: Sequence[_Actor]) -> dict[tuple[str, str], str]:
+  """Returns the name of each folder's column, by folder and column.
+
+  Folders with other worlds share a column. Where one has a cell that another
+  has, its whole column gets its name, so that no mean is of both.
 
   Raises:
-    ResultsError: If no name tells the two apart.
+    ResultsError: If that name is taken as well.
   """
-  world, column = actor.place
-  names = [pathlib.Path(actor.source).name, actor.run.name]
-  if actor.source == shown[actor.place].source:
-    del names[0]
-  for name in names:
-    if (place := (world, f'{column} ({name})')) not in shown:
-      return place
-  raise errors.ResultsError(
-      f'{actor.source}: {world} x {column} is in'
-      f' {shown[actor.place].source} as well; must be in one of them, or in'
-      ' folders and runs of other names'
-  )
+  places: dict[tuple[str, str], set[_Place]] = {}
+  for actor in learned:
+    places.setdefault((actor.source, actor.column), set()).add(actor.place)
+  names: dict[tuple[str, str], str] = {}
+  sources: dict[_Place, str] = {}
+  for (source, column), cells in places.items():
+    name = column
+    if taken := sorted(cells & sources.keys()):
+      name = f'{column} ({pathlib.Path(source).name})'
+      if name in names.values():
+        raise errors.ResultsError(
+            f'{source}: {" x ".join(taken[0])} is in {sources[taken[0]]} as'
+            ' well, and a folder of the same name; must have another one'
+        )
+    sources = dict.fromkeys(cells, source) | sources
+    names[source, column] = name
+  return names
 
 
 def _differences(shown: Mapping[_Place, _Actor]) -> Iterator[str]:

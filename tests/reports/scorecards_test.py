@@ -1,6 +1,7 @@
 """Tests of scorecards: admission, columns, versions, and their files."""
 
 import csv
+import types
 
 import pandas as pd
 import pytest
@@ -203,8 +204,21 @@ def test_cells_of_one_agent_in_two_folders_have_names_of_their_own(tmp_path):
   ]
   columns = scorecards.make(folders[:2]).columns
   assert [one for one in columns if 'mine' in one] == ['mine', 'mine (two)']
-  with pytest.raises(errors.ResultsError, match='of other names'):
+  with pytest.raises(errors.ResultsError, match='a folder of the same name'):
     scorecards.make(folders)
+
+
+def test_a_column_of_a_folder_stays_whole():
+  cells = (('one', 'near'), ('two', 'far'), ('three', 'near'), ('three', 'far'))
+  learned = [
+      types.SimpleNamespace(source=folder, column='mine', place=(world, 'mine'))
+      for folder, world in cells
+  ]
+  assert scorecards._columns(learned) == {
+      ('one', 'mine'): 'mine',
+      ('two', 'mine'): 'mine',
+      ('three', 'mine'): 'mine (three)',
+  }
 
 
 def test_the_version_follows_the_dynamics_and_the_worlds(tmp_path):

@@ -162,3 +162,11 @@ def test_equal_training_episodes_are_counted():
       (10, 0.0, 2, False), (10, 2.0, 1, False), (20, 0.0, 1, True),
       (20, None, 1, False),
   ]  # fmt: skip
+
+
+def test_curves_without_an_episode_are_read():
+  # Who learns offline has none, so these columns are left out.
+  point = curves.point(64, [], {'value': 0.5})
+  kept = {'step': 64, 'num_episodes': 0, 'num_invalid': 0, 'learner/value': 0.5}
+  read = publishing._reader({0: [kept]}, {0: []})
+  assert read(0, study.CURVE) == [point]
