@@ -10,7 +10,9 @@ from realab_suite.lab.experiments import experiment_specs
 from tests.docs import pages
 from tests.docs import workshop
 
-_OF_READERS = re.compile(r'/path/to|--import=my_')
+_OF_READERS = re.compile(r'/path/to|--import=my_|mine\.yaml|<file>')
+# Tests make experiments small, with few episodes.
+_OF_WHOLE_EXPERIMENTS = re.compile(r'--entry=|--episode=')
 # Its solver earns nothing in short episodes, so there is no stake.
 _WITH_WHOLE_EPISODES = 'docs/worlds.md'
 _OF_SYSTEM = re.compile(r'^(?:apt-get|docker|ray)', re.MULTILINE)
@@ -64,7 +66,7 @@ def _script(piece, sockets):
   text = text.replace('unix:/tmp/realab/', f'unix:{sockets}/')
   text = re.sub(r' \[[^\]=]*\]', '', text) if 'campaigns.' in text else text
   if piece.kind == 'span':
-    if re.match(r'\w+ --', text) and not text.startswith('realab'):
+    if re.match(r'(?!realab|uvx?)\w+ --', text):
       text = f'realab {text}'
       if not re.search('--(?:in|out)put', text):
         text += ' --help'  # Unknown flags are refused nevertheless.
@@ -99,6 +101,8 @@ def _why_not(script):
   """Returns why a script is not for tests, or ''."""
   if found := _OF_READERS.search(script):
     return f'{found[0]} stands for something of the reader'
+  if found := _OF_WHOLE_EXPERIMENTS.search(script):
+    return f'{found[0]} names what only whole experiments have'
   if found := _OF_SYSTEM.search(script):
     return f'{found[0]} changes the machine, or starts other programs'
   return ''

@@ -275,6 +275,7 @@ def _python(arguments: list[str], notes: int) -> None:
     exec(rest[0], {'__name__': '__main__'})
   elif option != '-m':
     sys.argv = arguments
+    sys.path.insert(0, os.path.dirname(option))
     runpy.run_path(option, run_name='__main__')
   elif rest[0] == 'venv':
     folder = pathlib.Path(rest[1], 'bin')
