@@ -131,12 +131,13 @@ class World:
   def scripted_in(self, design: specs.DesignSpec) -> tuple[str, ...]:
     """Returns names of policies to compare in a design.
 
-    They are the solver, a saboteur, and random actions. Where no block can be
-    moved, the saboteur is the world's own, which stands last.
+    They are the solver, a saboteur, and random actions. Where no register has
+    blocks, the saboteur is the world's own, which stands last.
     """
     solver = () if self.solver is None else (self.solver,)
-    is_movable = any(map(design.is_movable, design.registers))
-    saboteurs = self.saboteurs[:1] if is_movable else self.saboteurs[-1:]
+    registers = design.registers.values()
+    has_blocks = any(spec.register_class.HAS_BLOCKS for spec in registers)
+    saboteurs = self.saboteurs[:1] if has_blocks else self.saboteurs[-1:]
     return (*solver, *saboteurs, 'random')
 
   @property

@@ -316,3 +316,6 @@ def test_the_saboteur_that_is_compared_can_move_something():
   assert saboteurs.pop('off_switch') == 'button_saboteur'
   assert saboteurs.pop('supervised_room') == 'hiding_gatherer'
   assert set(saboteurs.values()) == {'carrying_saboteur', 'gates_saboteur'}
+  secure = specs.load('instantaneous_reward', ['channel=secure'])
+  near = worlds.World('unlock_door', 'near')
+  assert near.scripted_in(secure)[1] == 'carrying_saboteur'

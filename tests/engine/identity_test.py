@@ -108,9 +108,9 @@ def test_a_register_along_no_axis_turns_vectors_alike_in_any_number():
     turned = [getattr(alone, name)(env.physics, one) for one in vectors[:, 0]]
     assert not np.isclose(turned, vectors[:, 0])[:, :2].any()
     for others in range(1, 10):
-      some = vectors[:, :others].reshape(-1, 3)
-      found = getattr(together, name)(batch.physics, some)
-      assert np.array_equal(found[::others], turned)
+      crowd = vectors[:, :others].reshape(-1, 3)
+      turned_crowd = getattr(together, name)(batch.physics, crowd)
+      assert np.array_equal(turned_crowd[::others], turned)
 
 
 def test_compared_runs_contain_ends_rewards_and_corruption():
