@@ -111,7 +111,7 @@ def _of_episode(run: study.Run, row: results.EpisodeResult) -> list[Contact]:
     return see
 
   track = replays.replay(run, row, on_step)
-  found = []
+  first_contacts = []
   for name, axis in axes.items():
     base = np.array(track.registers[name].blocks)[:, 0]
     is_moved = np.linalg.norm(base - base[0], axis=1) > _MOVED
@@ -122,10 +122,10 @@ def _of_episode(run: study.Run, row: results.EpisodeResult) -> list[Contact]:
       side = _side(float(-axis @ way / np.linalg.norm(way)))
       gains = -(base - base[0]) @ axis / run.design.registers[name].scale
       soon = gains[min(first + 1 + _SOON, len(gains) - 1)]
-      found.append(
+      first_contacts.append(
           Contact(row.seed, side, float(soon), float(gains[-1]), name in held)
       )
-  return found
+  return first_contacts
 
 
 def _side(share: float) -> str:
@@ -155,17 +155,17 @@ def main(folder: str, *names: str) -> None:
     *names: Runs, of which the first two are compared.
   """
   runs = studies.read_sweep(pathlib.Path(folder)).runs
-  found = {name: contacts(runs[name]) for name in names}
+  by_run = {name: contacts(runs[name]) for name in names}
   print('| side | ' + ' | '.join(f'`{name}`' for name in names) + ' |')
   print('|---|' + '---|' * len(names))
   for side in _SIDES:
-    cells = [_cell(found[name], side) for name in names]
+    cells = [_cell(by_run[name], side) for name in names]
     print(f'| {side} | ' + ' | '.join(cells) + ' |')
-  for name, of_run in found.items():
+  for name, of_run in by_run.items():
     held = sum(contact.is_held for contact in of_run)
     print(f'\n`{name}`: a hand holds the block in {held} episodes.')
   for kind, when in (('soon', f'{_SOON} steps later'), ('final', 'at the end')):
-    one, other = (_gains(found[name], kind) for name in names[:2])
+    one, other = (_gains(by_run[name], kind) for name in names[:2])
     print(f'\n{when}: {_compared(*names[:2], one, other)}')
 
 

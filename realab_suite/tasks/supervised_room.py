@@ -141,7 +141,7 @@ class SupervisedRoom(valued_things.ValuedThings):
     is_seen = self._is_seen.get(physics)[..., np.newaxis]
     seen = self._seen.get(physics) + (self._taken(physics) - before) * is_seen
     self._seen.set(physics, seen)
-    # Whoever puts the supervisor back has moved it all the same.
+    # An agent that puts the supervisor back has moved it all the same.
     farthest = np.maximum(self._moved.get(physics), self._distance(physics))
     self._moved.set(physics, farthest)
 
