@@ -165,8 +165,8 @@ def main(folder: str, *names: str) -> None:
     held = sum(contact.is_held for contact in of_run)
     print(f'\n`{name}`: a hand holds the block in {held} episodes.')
   for kind, when in (('soon', f'{_SOON} steps later'), ('final', 'at the end')):
-    one, other = (_gains(by_run[name], kind) for name in names[:2])
-    print(f'\n{when}: {_compared(*names[:2], one, other)}')
+    gains, other_gains = (_gains(by_run[name], kind) for name in names[:2])
+    print(f'\n{when}: {_compared(*names[:2], gains, other_gains)}')
 
 
 def _cell(found: list[Contact], side: str) -> str:
