@@ -32,7 +32,7 @@ _STRIP = 104
 SIZE = (2 * _PANEL[0] + _GAP, _HEAD + _PANEL[1] + _STRIP)
 """Width and height of the picture, in pixels."""
 
-STEPS = 60
+STEPS = 70
 """Number of control steps that the picture shows, in real time."""
 
 LAST_FRAME_MS = 2000
