@@ -10,7 +10,7 @@ import re
 
 from realab_suite import errors
 
-VERSION = '0.2.0'
+VERSION = '0.3.0'
 """Version of this package, which setup.cfg reads."""
 
 # Package, lowest version that works, first version that does not. setup.cfg
